@@ -1,0 +1,1 @@
+"""Algorithms: one file each, in the same order (config, model, batch, loss, act); the registry is a dict."""

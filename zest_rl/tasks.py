@@ -1,0 +1,63 @@
+"""The six kitchen tasks of the paper as rows of a table: everything that differs between tasks, and no code.
+
+Joint limits and goals are FrankaKitchen-v1's; two goals differ from that environment's own tasks (`knob2`, `knob3`
+name burners that it calls otherwise), so progress is always read from the joint itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from zest_rl.errors import BadInput, nearest
+
+
+@dataclass(frozen=True)
+class Task:
+    """One manipulation: which joint, how far, where to look, what to call it."""
+
+    name: str
+    joint: str
+    """Name of the MuJoCo joint; it starts at 0."""
+    goal: float
+    """Joint position of the goal, in rad (m for `sdoor`)."""
+    lookat: tuple[float, float, float]
+    """World point that cameras look at, in metres: the centre of the moving part."""
+    elevations: tuple[float, ...]
+    """Camera elevations of the ring of views, in degrees; negative looks down."""
+    goal_folder: str
+    """Folder of this task in the Visual Tasks Dataset."""
+    start_text: str
+    goal_text: str
+
+
+TASKS: dict[str, Task] = {
+    task.name: task
+    for task in (
+        Task("knob2", "knob_Joint_2", -0.88, (-0.3, 0.65, 1.65), (-35, -60), "turn_on_stove",
+             "stove turned off", "stove turned on"),
+        Task("knob3", "knob_Joint_3", -0.90, (0.1, 0.95, 1.65), (-35, -60), "turn_on_stove",
+             "stove turned off", "stove turned on"),
+        Task("ldoor", "left_hinge_cabinet", -1.25, (-0.6, 0.75, 2.6), (-10, -30), "open_cabinet",
+             "closed cabinet", "open cabinet"),
+        Task("rdoor", "right_hinge_cabinet", 1.45, (-0.4, 0.75, 2.6), (-10, -30), "open_cabinet",
+             "closed cabinet", "open cabinet"),
+        Task("sdoor", "slide_cabinet", 0.37, (0.0, 0.75, 2.6), (-10, -30), "open_sliding_door",
+             "closed sliding door", "open sliding door"),
+        Task("micro", "microwave", -0.75, (-0.75, 0.5, 1.8), (-10, -30), "open_microwave",
+             "closed microwave", "open microwave"),
+    )
+}  # fmt: skip
+
+SUCCESS_PROGRESS = 0.999
+"""A step is a success when clipped progress reaches this; progress = joint position / goal."""
+
+
+def get_task(name: str) -> Task:
+    """Return the task called `name`.
+
+    Raises:
+        BadInput: there is no such task; the message names the nearest ones.
+    """
+    if name not in TASKS:
+        raise BadInput(f"unknown task {name!r}; {nearest(name, TASKS)}")
+    return TASKS[name]
