@@ -207,3 +207,10 @@ def provenance() -> dict[str, Any]:
         "platform": f"{platform.system()} {platform.machine()}",
         "git_revision": git_revision(),
     }
+
+
+def shipped(kind: str) -> Path:
+    """Return the folder of the recipes that come with the package: ``datasets``, ``train`` or ``eval``."""
+    package = Path(__file__).resolve().parent
+    in_wheel = package / "recipes" / kind
+    return in_wheel if in_wheel.exists() else package.parent / kind

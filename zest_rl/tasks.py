@@ -21,7 +21,7 @@ class Task:
     goal: float
     """Joint position of the goal, in rad (m for `sdoor`)."""
     lookat: tuple[float, float, float]
-    """World point that cameras look at, in metres: the centre of the moving part."""
+    """World point that cameras look at, in metres: in or before the middle of the moving part, closed and open."""
     elevations: tuple[float, ...]
     """Camera elevations of the ring of views, in degrees; negative looks down."""
     goal_folder: str
@@ -33,17 +33,17 @@ class Task:
 TASKS: dict[str, Task] = {
     task.name: task
     for task in (
-        Task("knob2", "knob_Joint_2", -0.88, (-0.3, 0.65, 1.65), (-35, -60), "turn_on_stove",
+        Task("knob2", "knob_Joint_2", -0.88, (-0.22, 0.5, 2.12), (-20, -35), "turn_on_stove",
              "stove turned off", "stove turned on"),
-        Task("knob3", "knob_Joint_3", -0.90, (0.1, 0.95, 1.65), (-35, -60), "turn_on_stove",
+        Task("knob3", "knob_Joint_3", -0.90, (0.2, 0.75, 1.65), (-25, -40), "turn_on_stove",
              "stove turned off", "stove turned on"),
-        Task("ldoor", "left_hinge_cabinet", -1.25, (-0.6, 0.75, 2.6), (-10, -30), "open_cabinet",
+        Task("ldoor", "left_hinge_cabinet", -1.25, (-0.82, 0.45, 2.6), (-10, -30), "open_cabinet",
              "closed cabinet", "open cabinet"),
-        Task("rdoor", "right_hinge_cabinet", 1.45, (-0.4, 0.75, 2.6), (-10, -30), "open_cabinet",
+        Task("rdoor", "right_hinge_cabinet", 1.45, (-0.36, 0.45, 2.6), (-10, -30), "open_cabinet",
              "closed cabinet", "open cabinet"),
-        Task("sdoor", "slide_cabinet", 0.37, (0.0, 0.75, 2.6), (-10, -30), "open_sliding_door",
+        Task("sdoor", "slide_cabinet", 0.37, (0.12, 0.45, 2.6), (-10, -30), "open_sliding_door",
              "closed sliding door", "open sliding door"),
-        Task("micro", "microwave", -0.75, (-0.75, 0.5, 1.8), (-10, -30), "open_microwave",
+        Task("micro", "microwave", -0.75, (-0.87, 0.33, 1.8), (-10, -30), "open_microwave",
              "closed microwave", "open microwave"),
     )
 }  # fmt: skip

@@ -1,1 +1,64 @@
-"""Algorithms: one file each, in the same order (config, model, batch, loss, act); the registry is a dict."""
+"""Algorithms: one file each, in the same order (config, model, batch, loss, act); the registry is a dict.
+
+To add one, copy the file that is nearest to it and add a line to `AGENTS`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+
+from zest_rl.agents import bc, dt
+from zest_rl.agents.base import Agent, DataFacts, Policy
+from zest_rl.artifacts import hash_bytes, read_json
+from zest_rl.errors import BadInput, ZestError, nearest
+
+__all__ = ["AGENTS", "Agent", "Policy", "get_agent", "load_policy"]
+
+AGENTS: dict[str, Agent[Any]] = {
+    "bc": bc.AGENT,
+    "dt": dt.AGENT,
+}
+
+
+def get_agent(name: str) -> Agent[Any]:
+    """Return the agent called `name`.
+
+    Raises:
+        BadInput: there is no such agent; the message names the nearest ones.
+    """
+    if name not in AGENTS:
+        raise BadInput(f"unknown agent {name!r}; {nearest(name, AGENTS)}")
+    return AGENTS[name]
+
+
+def load_policy(run_dir: Path, device: str = "cpu") -> Policy:
+    """Return the policy that a finished run left in `run_dir`; it acts in the precision it was trained in.
+
+    Raises:
+        ZestError: the run is not finished, or its weights are not the ones that ``meta.json`` names.
+        BadInput: its agent is unknown here.
+    """
+    meta: dict[str, Any] = read_json(run_dir / "meta.json")
+    agent = get_agent(meta["agent"])
+    path = run_dir / "model.safetensors"
+    try:
+        weights = path.read_bytes()
+    except OSError as error:
+        raise ZestError(f"cannot read {path}: {error.strerror}; train again into a new folder") from error
+    if hash_bytes(weights) != meta["model_sha256"]:
+        raise ZestError(
+            f"{path} is damaged: its sha256 is {hash_bytes(weights)}, meta.json says {meta['model_sha256']}; "
+            "restore it from a copy or train again into a new folder"
+        )
+    config = agent.config(**meta["config"])
+    facts = DataFacts(**{field.name: meta[field.name] for field in fields(DataFacts)})
+    with torch.random.fork_rng(devices=[]):  # building draws weights that are replaced at once
+        model = agent.build(config, facts)
+    model.load_state_dict(safetensors.torch.load(weights))
+    target = torch.device(device)
+    return agent.policy(model.to(target).eval(), config, facts, meta, target)

@@ -1,0 +1,37 @@
+# `make demo` and `make test` do all the set-up themselves.
+ZEST := .venv/bin/zest
+PYTEST := OMP_NUM_THREADS=1 .venv/bin/python -m pytest --durations=15
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-slow lint bench clean
+
+help: ## list the targets
+	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1|\2/' | column -t -s '|'
+
+setup: .venv/.complete ## make .venv with the tested versions, and install the GL libraries if they are missing
+
+.venv/.complete: pyproject.toml constraints.txt .ci/setup.sh
+	.ci/setup.sh
+	touch $@
+
+demo: setup ## reproduce one task end to end and write its report; offline after the set-up
+	$(ZEST) reproduce eval/demo.toml
+
+test: lint ## lint and all quick tests
+	-.ci/setup.sh browser
+	$(PYTEST) -n 2 --dist loadfile -m "not slow"
+
+test-slow: setup ## the tests that take longer than a minute each
+	$(PYTEST) -m slow
+
+lint: setup ## ruff and mypy
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+
+bench: setup ## compare speeds with other implementations
+	@set -e; for file in benchmarks/*.py; do echo "== $$file"; .venv/bin/python "$$file"; done
+
+clean: ## remove caches and builds; keeps .venv, runs and datasets
+	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
+	find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +

@@ -1,0 +1,93 @@
+"""CPU time per 224x224 kitchen frame: `zest_rl.rendering` against ``env.render()`` of gymnasium-robotics.
+
+Both draw on the same machine, in the same process, with the same GL backend. The clock is the processor time of all
+threads of the process, because software GL may spread a frame over several cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+
+import gymnasium
+import gymnasium_robotics
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.rendering import N_QPOS, RenderConfig, StateRenderer, ring, select_gl_backend
+from zest_rl.tasks import TASKS
+
+SIZE = 224
+REQUIRED_RATIO = 40.0
+N_PEER_FRAMES = 5
+N_STATES = 8
+
+
+def peer_ms() -> tuple[float, NDArray[np.float64]]:
+    """Return cpu-ms per frame of ``env.render()``, and the (N_STATES, 30) states of a random rollout."""
+    gymnasium.register_envs(gymnasium_robotics)
+    env = gymnasium.make("FrankaKitchen-v1", render_mode="rgb_array", width=SIZE, height=SIZE, disable_env_checker=True)
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    env.render()  # the first frame pays for the GL context
+    states, seconds = [], 0.0
+    for step in range(N_STATES):
+        env.step(env.action_space.sample())
+        states.append(env.unwrapped.data.qpos.copy())
+        if step < N_PEER_FRAMES:
+            start = time.process_time()
+            env.render()
+            seconds += time.process_time() - start
+    env.close()
+    return 1e3 * seconds / N_PEER_FRAMES, np.stack(states)
+
+
+def ours_ms(config: RenderConfig, states: NDArray[np.float64]) -> float:
+    """Return cpu-ms per frame over all tasks' cameras: 24 views of each state (S, 30), with the objects moving."""
+    cameras = tuple(camera for task in TASKS.values() for camera in ring(task, 4))
+    with StateRenderer(config, cameras) as renderer:
+        renderer.render(np.zeros(N_QPOS))
+        start = time.process_time()
+        for state in states:
+            renderer.render(state)
+        seconds = time.process_time() - start
+    return 1e3 * seconds / (len(states) * len(cameras))
+
+
+def run() -> dict[str, object]:
+    """Return cpu-ms per frame of both renderers, their ratios, and whether the required ratio is met."""
+    backend = select_gl_backend()
+    peer, states = peer_ms()
+    states[:, 22] = np.linspace(0, TASKS["micro"].goal, len(states))  # the microwave opens
+    hidden = ours_ms(RenderConfig(size=SIZE), states)
+    shown = ours_ms(RenderConfig(size=SIZE, robot=True), states)
+    return {
+        "gl_backend": backend,
+        "env_render_cpu_ms": round(peer, 1),
+        "robot_hidden_cpu_ms": round(hidden, 2),
+        "robot_shown_cpu_ms": round(shown, 2),
+        "robot_hidden_ratio": round(peer / hidden, 1),
+        "robot_shown_ratio": round(peer / shown, 1),
+        "required_ratio": REQUIRED_RATIO,
+        "passed": peer / hidden >= REQUIRED_RATIO,
+    }
+
+
+def main() -> None:
+    """Print the comparison; exit with 1 when the required ratio is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    as_json = parser.parse_args().json
+    result = run()
+    if as_json:
+        print(json.dumps(result))
+    else:
+        for name, value in result.items():
+            print(f"{name:20} {value}")
+    sys.exit(0 if result["passed"] else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+"""Behaviour cloning: an MLP from the observation to the action, mean squared error.
+
+The baseline of Chen et al. 2021 (https://arxiv.org/abs/2106.01345; ``gym/decision_transformer/models/mlp_bc.py`` of
+https://github.com/kzl/decision-transformer at 5605e40): linear, ReLU and dropout, three hidden layers, tanh.
+Deviations from it:
+  - one observation instead of the last K: a plain Markov policy;
+  - hidden size 512, which gives about as many parameters as `dt.DTConfig` has (0.56 and 0.63 million for the kitchen);
+  - 1280 transitions per update, as many as the Decision Transformer's 64 windows of 20;
+  - learning rate, warm-up and observation normaliser are those of `dt`.
+``top_fraction`` below 1 is the "best x % BC" of that paper: only the episodes with the largest returns are cloned (a
+share of the episodes here, of the time steps there). The normaliser is measured on all episodes nevertheless, so that
+it is the same for every fraction and every agent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from zest_rl.agents.base import (
+    Agent,
+    Batch,
+    DataFacts,
+    Policy,
+    Precision,
+    Sampler,
+    autocast,
+    check_fields,
+    check_obs,
+    optimizer_rules,
+)
+from zest_rl.types import Episode, FloatArray
+
+# ---------------------------------------------------------------------------------------------------------- config
+
+
+@dataclass(frozen=True)
+class BCConfig:
+    """Behaviour cloning."""
+
+    top_fraction: float = 1.0
+    """Share of the episodes that is cloned, those with the largest returns; 1 clones all and never reads a reward."""
+    hidden_size: int = 512
+    """Units per hidden layer."""
+    n_layers: int = 3
+    """Hidden layers."""
+    dropout: float = 0.1
+    """Share of hidden units that is zeroed while training."""
+    batch_size: int = 1280
+    """Transitions per update."""
+    learning_rate: float = 3e-4
+    """AdamW's step size after warm-up."""
+    weight_decay: float = 1e-4
+    """AdamW's decoupled weight decay."""
+    warmup_updates: int = 200
+    """Updates over which the step size rises linearly from 0."""
+    grad_clip: float = 0.25
+    """Largest Euclidean norm of the gradient."""
+    amp: Precision = "auto"
+    """Precision of matrix products; auto is bf16 where the hardware has it."""
+
+    def __post_init__(self) -> None:
+        check_fields("BC config", self, {
+            "top_fraction": (0 < self.top_fraction <= 1, "in (0, 1]"),
+            "hidden_size": (self.hidden_size >= 1, "at least 1"),
+            "n_layers": (self.n_layers >= 1, "at least 1"),
+            "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
+            "batch_size": (self.batch_size >= 1, "at least 1"),
+            **optimizer_rules(self),
+        })  # fmt: skip
+
+
+# ----------------------------------------------------------------------------------------------------------- model
+
+
+def build_model(config: BCConfig, facts: DataFacts) -> nn.Module:
+    """Return the MLP: [batch, obs_dim] → [batch, act_dim] in [-1, 1]."""
+    layers: list[nn.Module] = []
+    width = facts.obs_dim
+    for _ in range(config.n_layers):
+        layers += [nn.Linear(width, config.hidden_size), nn.ReLU(), nn.Dropout(config.dropout)]
+        width = config.hidden_size
+    return nn.Sequential(*layers, nn.Linear(width, facts.act_dim), nn.Tanh())
+
+
+# ----------------------------------------------------------------------------------------------------------- batch
+
+
+def make_sampler(config: BCConfig, facts: DataFacts, episodes: Sequence[Episode]) -> Sampler:
+    """Return a function that draws transitions, each of the kept episodes' steps being equally likely."""
+    if config.top_fraction < 1:
+        n_kept = math.ceil(config.top_fraction * len(episodes))
+        returns = np.array([e.rewards.sum(dtype=np.float64) for e in episodes])
+        episodes = [episodes[i] for i in np.argsort(-returns, kind="stable")[:n_kept]]
+    obs = torch.from_numpy(facts.normalize(np.concatenate([e.obs[:-1] for e in episodes])))
+    actions = torch.from_numpy(np.concatenate([e.actions for e in episodes]))
+
+    def sample(rng: np.random.Generator) -> Batch:
+        index = torch.from_numpy(rng.integers(len(obs), size=config.batch_size))
+        return {
+            "obs": obs[index],  # [batch, obs_dim]
+            "actions": actions[index],  # [batch, act_dim]
+        }
+
+    return sample
+
+
+# ------------------------------------------------------------------------------------------------------------ loss
+
+
+def loss(model: nn.Module, batch: Batch) -> Tensor:
+    """Return the squared error, averaged over the batch and the action's dimensions."""
+    predicted: Tensor = model(batch["obs"])  # [batch, act_dim]
+    return (predicted.float() - batch["actions"]).square().mean()
+
+
+# ------------------------------------------------------------------------------------------------------------- act
+
+
+class BCPolicy:
+    """The MLP at work; it has no memory and asks for no return."""
+
+    agent = "bc"
+    uses_return = False
+
+    def __init__(self, model: nn.Module, facts: DataFacts, meta: dict[str, Any], device: torch.device):
+        self.meta = meta
+        self._model, self._facts, self._device = model, facts, device
+        self._autocast = autocast(meta["precision"], device)
+        self._n_episodes = 0
+
+    def begin(self, n_episodes: int, target_return: float | None = None) -> None:
+        """Start N episodes; the target return is not used."""
+        self._n_episodes = n_episodes
+
+    @torch.no_grad()
+    def act(self, obs: FloatArray) -> FloatArray:
+        """Return actions (N, act_dim) float32 in [-1, 1] for obs (N, obs_dim) float32."""
+        check_obs(obs, self._n_episodes, self._facts.obs_dim)
+        normalized = torch.from_numpy(self._facts.normalize(obs)).to(self._device)
+        with self._autocast:
+            actions: Tensor = self._model(normalized).float()
+        return actions.cpu().numpy()
+
+    def observe(self, rewards: FloatArray) -> None:
+        """Rewards change nothing here."""
+
+
+def make_policy(
+    model: nn.Module, config: BCConfig, facts: DataFacts, meta: dict[str, Any], device: torch.device
+) -> Policy:
+    """Return the policy of a trained model."""
+    return BCPolicy(model, facts, meta, device)
+
+
+AGENT = Agent(config=BCConfig, build=build_model, sampler=make_sampler, loss=loss, policy=make_policy)

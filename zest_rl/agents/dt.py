@@ -1,0 +1,285 @@
+"""Decision Transformer: a causal transformer over (return-to-go, observation, action), asked for a return.
+
+Chen et al. 2021 (https://arxiv.org/abs/2106.01345; ``gym/`` of https://github.com/kzl/decision-transformer at 5605e40).
+The network is `transformers.DecisionTransformerModel`, and a run's ``model.safetensors`` loads into that class as it
+is. The hyper-parameters are theirs (hidden size 128, 3 layers, 1 head, K = 20, ReLU, dropout 0.1, batch 64, gradient
+clip 0.25, weight decay 1e-4). Deviations:
+  - returns are divided by the largest absolute return of the data, not by 1000;
+  - learning rate 3e-4 with 200 updates of warm-up instead of 1e-4 with 10,000, as we train for thousands of updates,
+    not for a hundred thousand;
+  - observations are normalised with a floor under the deviation and a bound on the result (`base.STD_FLOOR`);
+  - padding repeats a valid step instead of a constant; as there, nothing attends to it and the loss leaves it out;
+  - transformers initialises every embedding with a deviation of 0.02, they with torch's default;
+  - dropout masks are drawn four to a 64-bit random number, which is what makes them cheap on a CPU.
+``condition_on_return=False`` is the null control: the return-to-go is zero at every step, in training and acting.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from transformers import DecisionTransformerConfig, DecisionTransformerModel
+
+from zest_rl.agents.base import (
+    Agent,
+    Batch,
+    DataFacts,
+    Policy,
+    Precision,
+    Sampler,
+    autocast,
+    check_fields,
+    check_obs,
+    optimizer_rules,
+    returns_to_go,
+)
+from zest_rl.errors import BadInput
+from zest_rl.types import Episode, FloatArray
+
+# ---------------------------------------------------------------------------------------------------------- config
+
+
+@dataclass(frozen=True)
+class DTConfig:
+    """Decision Transformer."""
+
+    condition_on_return: bool = True
+    """False zeroes the return-to-go: the same network without what the scores can tell it."""
+    context_len: int = 20
+    """K, the steps that the network sees."""
+    hidden_size: int = 128
+    """Width of a token."""
+    n_layers: int = 3
+    """Transformer blocks."""
+    n_heads: int = 1
+    """Attention heads per block."""
+    dropout: float = 0.1
+    """Share zeroed of embeddings, residual branches and attention weights while training."""
+    batch_size: int = 64
+    """Windows of K steps per update."""
+    learning_rate: float = 3e-4
+    """AdamW's step size after warm-up."""
+    weight_decay: float = 1e-4
+    """AdamW's decoupled weight decay."""
+    warmup_updates: int = 200
+    """Updates over which the step size rises linearly from 0."""
+    grad_clip: float = 0.25
+    """Largest Euclidean norm of the gradient."""
+    amp: Precision = "auto"
+    """Precision of matrix products; auto is bf16 where the hardware has it."""
+
+    def __post_init__(self) -> None:
+        check_fields("DT config", self, {
+            "context_len": (self.context_len >= 1, "at least 1"),
+            "hidden_size": (self.hidden_size >= 1, "at least 1"),
+            "n_layers": (self.n_layers >= 1, "at least 1"),
+            "n_heads": (
+                self.n_heads >= 1 and self.hidden_size % self.n_heads == 0,
+                f"a divisor of hidden_size ({self.hidden_size})",
+            ),
+            "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
+            "batch_size": (self.batch_size >= 1, "at least 1"),
+            **optimizer_rules(self),
+        })  # fmt: skip
+
+
+# ----------------------------------------------------------------------------------------------------------- model
+
+
+class CheapDropout(nn.Dropout):
+    """Dropout whose mask takes 16 random bits per element, so p is rounded to 1/65536.
+
+    ``nn.Dropout`` draws a random number per element, on a CPU a fifth of a training step in bf16.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return `x` with a share p zeroed and the rest divided by 1 − p, as `nn.Dropout` does; any shape."""
+        if not self.training or self.p == 0:
+            return x
+        bits = torch.empty((x.numel() + 3) // 4, dtype=torch.int64, device=x.device).random_(-(2**63), None)
+        keep = bits.view(torch.int16)[: x.numel()].view(x.shape) >= round(self.p * 2**16) - 2**15
+        return x * keep / (1 - self.p)
+
+
+def build_model(config: DTConfig, facts: DataFacts) -> nn.Module:
+    """Return transformers' model, its unused parts (token table, observation and return heads) frozen."""
+    model = DecisionTransformerModel(
+        DecisionTransformerConfig(
+            state_dim=facts.obs_dim,
+            act_dim=facts.act_dim,
+            hidden_size=config.hidden_size,
+            max_ep_len=facts.max_steps,
+            n_positions=3 * config.context_len,
+            n_layer=config.n_layers,
+            n_head=config.n_heads,
+            activation_function="relu",
+            resid_pdrop=config.dropout,
+            embd_pdrop=config.dropout,
+            attn_pdrop=config.dropout,
+            bos_token_id=None,
+            eos_token_id=None,
+            use_cache=False,  # else every pass copies the keys and values
+            attn_implementation="eager",  # type: ignore[call-arg]  # faster than sdpa on a CPU: 60 tokens, dropout
+        )
+    )
+    for unused in (model.encoder.wte, model.predict_state, model.predict_return):
+        unused.requires_grad_(False)
+    for module in list(model.modules()):
+        for name, child in module.named_children():
+            if isinstance(child, nn.Dropout):
+                setattr(module, name, CheapDropout(child.p))
+    assert isinstance(model, nn.Module)
+    return model
+
+
+def predict_actions(model: nn.Module, batch: Batch) -> Tensor:
+    """Return the actions [batch, K, act_dim] float32 that the model would take at each step of its windows."""
+    output = model(
+        states=batch["obs"],
+        actions=batch["actions"],
+        returns_to_go=batch["rtg"],
+        timesteps=batch["timesteps"],
+        attention_mask=batch["valid"].long(),
+    )
+    predicted: Tensor = output.action_preds.float()
+    return predicted
+
+
+# ----------------------------------------------------------------------------------------------------------- batch
+
+
+def make_sampler(config: DTConfig, facts: DataFacts, episodes: Sequence[Episode]) -> Sampler:
+    """Return a function that draws windows of up to K steps, padded on the left.
+
+    Every step of the data is equally likely to start a window, which is to draw an episode in proportion to its
+    length and then a start in it. A window ends K steps later or with its episode.
+
+    Raises:
+        BadInput: all returns are zero although the model is to be conditioned on them.
+    """
+    if config.condition_on_return and facts.return_scale == 0:
+        raise BadInput(
+            "a Decision Transformer conditioned on returns needs returns that are not all 0; check that the dataset "
+            "is relabeled, or set condition_on_return to false"
+        )
+    scale = facts.return_scale if config.condition_on_return else np.inf
+    lengths = np.array([len(e) for e in episodes])
+    ends = np.repeat(np.cumsum(lengths), lengths)  # [step of the data], the first step after its episode
+    obs = torch.from_numpy(facts.normalize(np.concatenate([e.obs[:-1] for e in episodes])))
+    actions = torch.from_numpy(np.concatenate([e.actions for e in episodes]))
+    rtg = torch.from_numpy(np.concatenate([returns_to_go(e.rewards)[:-1] for e in episodes]) / np.float32(scale))
+    timesteps = torch.from_numpy(np.concatenate([np.arange(n) for n in lengths]))
+
+    def sample(rng: np.random.Generator) -> Batch:
+        first = rng.integers(len(ends), size=(config.batch_size, 1))
+        steps = np.minimum(first + config.context_len, ends[first]) + np.arange(-config.context_len, 0)
+        index = torch.from_numpy(np.maximum(steps, first))
+        return {
+            "obs": obs[index],  # [batch, K, obs_dim]
+            "actions": actions[index],  # [batch, K, act_dim]
+            "rtg": rtg[index][..., None],  # [batch, K, 1]
+            "timesteps": timesteps[index],  # [batch, K]
+            "valid": torch.from_numpy(steps >= first),  # [batch, K], False is padding
+        }
+
+    return sample
+
+
+# ------------------------------------------------------------------------------------------------------------ loss
+
+
+def loss(model: nn.Module, batch: Batch) -> Tensor:
+    """Return the squared error of the actions, averaged over the valid steps and the action's dimensions."""
+    error = (predict_actions(model, batch) - batch["actions"]).square()  # [batch, K, act_dim]
+    return error[batch["valid"]].mean()
+
+
+# ------------------------------------------------------------------------------------------------------------- act
+
+
+class DTPolicy:
+    """The transformer at work on the last K steps of N episodes."""
+
+    agent = "dt"
+
+    def __init__(
+        self, model: nn.Module, config: DTConfig, facts: DataFacts, meta: dict[str, Any], device: torch.device
+    ):
+        self.meta = meta
+        self.uses_return = config.condition_on_return
+        self._model, self._facts, self._device = model, facts, device
+        self._autocast = autocast(meta["precision"], device)
+        self._context_len = config.context_len
+        self._start(0, 0.0)
+
+    def _start(self, n_episodes: int, target_return: float) -> None:
+        n_steps = self._facts.max_steps
+        self._step = 0
+        self._remaining = np.full(n_episodes, target_return)  # (N,) return still asked for, in the data's units
+        self._obs = np.zeros((n_episodes, n_steps, self._facts.obs_dim), dtype=np.float32)
+        self._actions = np.zeros((n_episodes, n_steps, self._facts.act_dim), dtype=np.float32)
+        self._rtg = np.zeros((n_episodes, n_steps, 1), dtype=np.float32)
+
+    def begin(self, n_episodes: int, target_return: float | None = None) -> None:
+        """Forget what went before and start N episodes.
+
+        Raises:
+            BadInput: the model is conditioned on returns and `target_return` is not a finite number.
+        """
+        if self.uses_return and (target_return is None or not np.isfinite(target_return)):
+            raise BadInput(
+                f"a Decision Transformer must be asked for a finite return, got {target_return}; "
+                "take a quantile of the training returns from meta['return_quantiles']"
+            )
+        self._start(n_episodes, target_return or 0.0)
+
+    @torch.no_grad()
+    def act(self, obs: FloatArray) -> FloatArray:
+        """Return actions (N, act_dim) float32 in [-1, 1] for obs (N, obs_dim) float32, the newest of each episode.
+
+        Raises:
+            BadInput: the shape is wrong, or the episode outlasts the longest one of the training data.
+        """
+        check_obs(obs, len(self._remaining), self._facts.obs_dim)
+        step = self._step
+        if step >= self._facts.max_steps:
+            raise BadInput(
+                f"this model knows time steps below {self._facts.max_steps}, the longest episode of its data, got step "
+                f"{step}; evaluate with a horizon of at most {self._facts.max_steps}"
+            )
+        self._obs[:, step] = self._facts.normalize(obs)
+        if self.uses_return:
+            self._rtg[:, step, 0] = self._remaining / self._facts.return_scale
+        window = slice(max(0, step + 1 - self._context_len), step + 1)
+        arrays = {
+            "obs": self._obs[:, window],
+            "actions": self._actions[:, window],  # the newest is still zero; only later steps could attend to it
+            "rtg": self._rtg[:, window],
+            "timesteps": np.broadcast_to(np.arange(window.start, window.stop), self._obs[:, window].shape[:2]),
+            "valid": np.ones(self._obs[:, window].shape[:2], dtype=bool),
+        }
+        batch = {name: torch.tensor(array, device=self._device) for name, array in arrays.items()}
+        with self._autocast:
+            actions = predict_actions(self._model, batch)[:, -1]
+        self._actions[:, step] = actions.cpu().numpy()
+        self._step += 1
+        return self._actions[:, step].copy()
+
+    def observe(self, rewards: FloatArray) -> None:
+        """Take the rewards (N,) of the last actions off the returns still asked for."""
+        self._remaining = self._remaining - rewards
+
+
+def make_policy(
+    model: nn.Module, config: DTConfig, facts: DataFacts, meta: dict[str, Any], device: torch.device
+) -> Policy:
+    """Return the policy of a trained model."""
+    return DTPolicy(model, config, facts, meta, device)
+
+
+AGENT = Agent(config=DTConfig, build=build_model, sampler=make_sampler, loss=loss, policy=make_policy)

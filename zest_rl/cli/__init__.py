@@ -1,0 +1,171 @@
+"""The ``zest`` command: one verb is one stage, and one module here.
+
+A verb's module holds a frozen dataclass ``Config`` (its arguments) and ``run(config, ui) -> dict`` (a JSON-ready
+result). A verb with sub-verbs holds ``CONFIGS``, from sub-verb to config class, instead of ``Config``. Three keys of a
+result mean something to this frame: ``next`` is the command to type next, ``ok: False`` makes the exit code 1, and a
+module's own ``summary(result) -> str`` replaces the plain listing. Verb modules are imported when their verb is typed,
+and import heavy packages in ``run`` only, so that help answers at once.
+
+stdout carries the result, stderr everything else.
+"""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import json
+import os
+import sys
+import traceback
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
+from types import ModuleType
+from typing import Any
+
+from zest_rl import __version__
+from zest_rl.cli.recipes import COMMON_FLAGS, parse_config
+from zest_rl.cli.ui import StreamUi
+from zest_rl.errors import BadInput, ZestError, nearest
+
+VERBS = {
+    "doctor": "check versions, rendering, weights and disk; say how to mend each",
+    "collect": "an expert with noise → a Minari dataset",
+    "relabel": "a dataset and a goal (pictures or sentences) → a dataset with ZeST rewards",
+    "train": "a dataset → a policy, by `bc` or `dt`",
+    "evaluate": "a policy → returns and success in MuJoCo, with videos",
+    "reproduce": "a recipe → a whole table or figure, cell by cell; rerun it to resume",
+    "report": "results → one HTML file",
+}
+
+HELP = """usage: zest VERB [arguments]
+
+A picture or a sentence as the reward function for offline robot learning:
+goal spec + frames → embeddings → scores → relabeled dataset → trainer → policy → evaluation → report
+
+verbs (`zest VERB --help` lists the arguments of one):
+{verbs}
+
+{common}
+
+also: --help, --version
+
+exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted (run the same command again to go on)
+
+examples:
+  zest doctor
+  zest collect --task micro
+  zest reproduce eval/demo.toml""".format(
+    verbs="\n".join(f"  {verb:<10} {summary}" for verb, summary in VERBS.items()), common=COMMON_FLAGS
+)
+
+INTERRUPTED = 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run ``zest`` with `argv` (default: the process's own arguments) and return its exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    as_json = "--json" in words
+    try:
+        return _dispatch(words)
+    except SystemExit as stop:  # tyro has printed the help
+        return int(stop.code or 0)
+    except (Exception, KeyboardInterrupt) as error:
+        code, message = _explain(error)
+        if os.environ.get("ZEST_TRACEBACK"):
+            traceback.print_exc()
+        print(message if code == INTERRUPTED else f"error: {message}", file=sys.stderr)
+        if as_json:
+            problem = {"type": type(error).__name__, "message": message, "exit_code": code}
+            print(json.dumps({"error": problem}, indent=2))
+        return code
+
+
+def _dispatch(words: list[str]) -> int:
+    if not words:
+        print(HELP, file=sys.stderr)
+        return 2
+    first, *rest = words
+    if first in ("-h", "--help", "help"):
+        print(HELP)
+        return 0
+    if first == "--version":
+        print(f"zest {__version__}")
+        return 0
+    if first.startswith("-"):
+        raise BadInput(f"the verb comes first: zest VERB {first}; verbs: {', '.join(VERBS)}")
+    if first not in VERBS:
+        raise BadInput(f"unknown verb {first!r}; {nearest(first, VERBS)}")
+    return _run_verb(importlib.import_module(f"zest_rl.cli.{first}"), first, rest)
+
+
+def _run_verb(module: ModuleType, verb: str, words: list[str]) -> int:
+    config_class = getattr(module, "Config", None)
+    if config_class is None:
+        configs: Mapping[str, type[Any]] = module.CONFIGS
+        if words[:1] in (["-h"], ["--help"]):
+            print(_sub_verb_help(verb, configs))
+            return 0
+        if not words or words[0] not in configs:
+            got = repr(words[0]) if words else "nothing"
+            raise BadInput(
+                f"`zest {verb}` needs a sub-verb first, got {got}; {nearest(words[0] if words else '', configs)}"
+            )
+        config_class, verb, words = configs[words[0]], f"{verb} {words[0]}", words[1:]
+    config, as_json = parse_config(config_class, words, verb)
+    with redirect_stdout(sys.stderr):  # whatever a library prints must not mix with the result
+        result: dict[str, Any] = module.run(config, StreamUi())
+    if as_json:
+        print(json.dumps(result, indent=2, allow_nan=False))
+    else:
+        print(_readable(module, result))
+    return 0 if result.get("ok", True) else 1
+
+
+def _sub_verb_help(verb: str, configs: Mapping[str, type[Any]]) -> str:
+    lines = [f"  {name:<10} {(config.__doc__ or '').splitlines()[0]}" for name, config in configs.items()]
+    return "\n".join([f"usage: zest {verb} SUB-VERB [arguments]", "", *lines, "", f"`zest {verb} SUB-VERB --help`"])
+
+
+def _readable(module: ModuleType, result: Mapping[str, Any]) -> str:
+    shown = {key: value for key, value in result.items() if key not in ("next", "ok")}
+    text = module.summary(result) if hasattr(module, "summary") else "\n".join(_listing(shown))
+    return f"{text}\nnext: {result['next']}" if result.get("next") else text
+
+
+def _listing(value: Mapping[str, Any], indent: str = "") -> list[str]:
+    """Write a result as ``key: value`` lines, nested mappings indented."""
+    lines = []
+    for key, item in value.items():
+        if isinstance(item, Mapping):
+            lines += [f"{indent}{key}:", *_listing(item, indent + "  ")]
+        elif isinstance(item, list) and any(isinstance(entry, Mapping) for entry in item):
+            for index, entry in enumerate(item):
+                lines += [f"{indent}{key} {index + 1}:", *_listing(entry, indent + "  ")]
+        else:
+            lines.append(f"{indent}{key}: {_cell(item)}")
+    return lines
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list):
+        return ", ".join(map(_cell, value))
+    return str(value)
+
+
+def _explain(error: BaseException) -> tuple[int, str]:
+    """Return the exit code of a failure and what to tell the user."""
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED, "interrupted; run the same command again to go on"
+    if isinstance(error, ZestError):
+        return 2 if isinstance(error, BadInput) else 1, str(error)
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        return 1, f"the disk is full{_at(error)}; free some space and run the same command again to go on"
+    if isinstance(error, OSError):
+        return 1, f"{error.strerror or error}{_at(error)}"
+    return 1, f"unexpected {type(error).__name__}: {error}; ZEST_TRACEBACK=1 shows where"
+
+
+def _at(error: OSError) -> str:
+    return f" at {error.filename}" if error.filename else ""

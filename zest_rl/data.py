@@ -1,0 +1,211 @@
+"""Minari datasets on disk → episodes (`zest_rl.data_writer` is the way back; no other module touches HDF5).
+
+Layout of one dataset, alignment in `zest_rl.types`::
+
+    ROOT/zest/kitchen-micro-noisy-v0/
+      zest_manifest.json        sha256 of every file below; a change on disk is noticed
+      data/metadata.json        Minari's metadata, and under "zest" how the dataset was made
+      data/main_data.hdf5       episode_i/{observations (T+1, obs_dim), actions (T, act_dim), rewards (T,),
+                                terminations (T,), truncations (T,), infos/state/{qpos, qvel} (T+1, n),
+                                infos/gt/{reward, success} (T+1,), infos/zest/score (T+1,) once relabeled}
+
+Ground truth is read by `read_ground_truth` alone; `read_episodes` and `read_states` never open it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl import artifacts
+from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.types import Episode, FloatArray, GroundTruth
+
+DATASET_ID = re.compile(r"(?:[A-Za-z0-9][\w.-]+/)*[A-Za-z0-9][\w.-]*-v\d+")
+TRUSTED_ENTRY_POINTS = ("gymnasium.", "gymnasium_robotics.", "zest_rl.")
+DATA_FILE, METADATA_FILE, MANIFEST_FILE = "data/main_data.hdf5", "data/metadata.json", "zest_manifest.json"
+
+
+def datasets_root() -> Path:
+    """Minari's folder of local datasets: ``$MINARI_DATASETS_PATH``, else ``~/.minari/datasets``. Not created here."""
+    return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
+
+
+def dataset_path(dataset_id: str) -> Path:
+    """Return the folder of a dataset id, whether or not it exists.
+
+    Raises:
+        BadInput: the id is not of the form ``namespace/name-vN`` (so ``..`` cannot lead out of the root).
+    """
+    if not DATASET_ID.fullmatch(dataset_id) or ".." in dataset_id:
+        raise BadInput(
+            f"a dataset id must look like 'namespace/name-v0' (letters, digits, '.', '_', '-'; namespace of at least "
+            f"2 characters), got {dataset_id!r}"
+        )
+    return datasets_root() / dataset_id
+
+
+def list_datasets() -> list[str]:
+    """Return the ids of all complete datasets under the root, sorted."""
+    root = datasets_root()
+    found = (p.parent.parent.relative_to(root).as_posix() for p in root.glob(f"**/{METADATA_FILE}"))
+    return sorted(name for name in found if not any(part.startswith(".") for part in name.split("/")))
+
+
+def exists(dataset_id: str) -> bool:
+    """Whether a complete dataset of this id is on disk."""
+    return (dataset_path(dataset_id) / METADATA_FILE).exists()
+
+
+def read_metadata(dataset_id: str) -> dict[str, Any]:
+    """Return a dataset's metadata after checking that its files are as they were written.
+
+    Raises:
+        BadInput: no such dataset (the nearest are named), or its environment's code is not of a trusted package.
+        ZestError: a file was damaged or changed since it was written.
+    """
+    folder = dataset_path(dataset_id)
+    if not exists(dataset_id):
+        raise BadInput(
+            f"there is no dataset {dataset_id!r} under the Minari root; {nearest(dataset_id, list_datasets())}. "
+            "Make one with `zest collect`, or set MINARI_DATASETS_PATH to the folder that holds it"
+        )
+    if (folder / MANIFEST_FILE).exists():
+        for name, digest in artifacts.read_json(folder / MANIFEST_FILE).items():
+            path = folder / name
+            if not path.exists() or artifacts.hash_file(path) != digest:
+                raise ZestError(
+                    f"{name} of dataset {dataset_id} is missing or was changed since it was written; make the dataset "
+                    f"again, or, if you changed it on purpose, delete its {MANIFEST_FILE}"
+                )
+    metadata: dict[str, Any] = artifacts.read_json(folder / METADATA_FILE)
+    for key in ("env_spec", "eval_env_spec"):
+        entry_point = str(json.loads(metadata[key]).get("entry_point")) if metadata.get(key) else ""
+        if entry_point and not entry_point.startswith(TRUSTED_ENTRY_POINTS):
+            raise BadInput(
+                f"the {key} of dataset {dataset_id} would run code of {entry_point!r}; only "
+                f"{', '.join(p + '*' for p in TRUSTED_ENTRY_POINTS)} are trusted. Remove {key} from its metadata.json"
+            )
+    return metadata
+
+
+@contextmanager
+def _open(dataset_id: str) -> Iterator[tuple[h5py.File, list[str]]]:
+    read_metadata(dataset_id)
+    path = dataset_path(dataset_id) / DATA_FILE
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        raise BadInput(f"dataset {dataset_id} cannot be read as HDF5 ({error}); only that storage is read") from error
+    with file:
+        names = sorted(file, key=lambda name: int(name.removeprefix("episode_")))
+        if not names:
+            raise BadInput(f"dataset {dataset_id} has no episodes; collect it again")
+        yield file, names
+
+
+def _array(group: h5py.Group, name: str, dtype: type, dataset_id: str) -> NDArray[Any]:
+    if name not in group:
+        raise BadInput(
+            f"dataset {dataset_id} has no {name!r} in {group.name}; record it when the dataset is made "
+            "(zest_rl.data describes the layout)"
+        )
+    node = group[name]
+    if not isinstance(node, h5py.Dataset):
+        raise BadInput(f"{name!r} in {group.name} of dataset {dataset_id} must be one flat array, got a group")
+    return np.asarray(node[()], dtype=dtype)
+
+
+def _each(dataset_id: str, read: Callable[[h5py.Group], Any]) -> list[Any]:
+    results = []
+    with _open(dataset_id) as (file, names):
+        for name in names:
+            try:
+                results.append(read(file[name]))
+            except BadInput as error:
+                raise BadInput(f"{name} of dataset {dataset_id}: {error}") from error
+    return results
+
+
+def read_episodes(dataset_id: str) -> list[Episode]:
+    """Read what a trainer may see of every episode.
+
+    Raises:
+        BadInput: no such dataset, an episode without steps, lengths that do not fit, NaN.
+        ZestError: the files were damaged.
+    """
+
+    def read(group: h5py.Group) -> Episode:
+        ends = _array(group, "terminations", bool, dataset_id)
+        return Episode(
+            obs=_array(group, "observations", np.float32, dataset_id),
+            actions=_array(group, "actions", np.float32, dataset_id),
+            rewards=_array(group, "rewards", np.float32, dataset_id),
+            terminated=bool(len(ends) and ends[-1]),
+        )
+
+    return _each(dataset_id, read)
+
+
+def read_states(dataset_id: str) -> list[NDArray[np.float64]]:
+    """Read the simulator positions (T+1, nq) of every episode.
+
+    Raises:
+        BadInput: no such dataset, no recorded state, lengths that do not fit, NaN.
+    """
+
+    def read(group: h5py.Group) -> NDArray[np.float64]:
+        qpos = _array(group, "infos/state/qpos", np.float64, dataset_id)
+        n_steps = len(group["rewards"])
+        if n_steps == 0:
+            raise BadInput("an episode must have at least 1 step, got 0; drop empty episodes from the dataset")
+        if qpos.ndim != 2 or len(qpos) != n_steps + 1:
+            raise BadInput(f"infos/state/qpos must have shape ({n_steps + 1}, nq), got {qpos.shape}")
+        if not np.isfinite(qpos).all():
+            raise BadInput("infos/state/qpos must be finite, got NaN or infinity; drop the episode")
+        return qpos
+
+    return _each(dataset_id, read)
+
+
+def read_ground_truth(dataset_id: str) -> list[GroundTruth]:
+    """Read the hand-designed rewards of every episode: for evaluation and reports only, never for a trainer.
+
+    Raises:
+        BadInput: no such dataset, or no ground truth is recorded in it.
+    """
+
+    def read(group: h5py.Group) -> GroundTruth:
+        return GroundTruth(
+            rewards=_array(group, "infos/gt/reward", np.float32, dataset_id)[1:],
+            success=bool(_array(group, "infos/gt/success", bool, dataset_id).any()),
+        )
+
+    return _each(dataset_id, read)
+
+
+def read_scores(dataset_id: str) -> list[FloatArray]:
+    """Read the ZeST scores (T+1,) of every episode of a relabeled dataset.
+
+    Raises:
+        BadInput: no such dataset, or it was not relabeled.
+    """
+    return _each(dataset_id, lambda group: _array(group, "infos/zest/score", np.float32, dataset_id))
+
+
+def fingerprint(dataset_id: str) -> str:
+    """Hash what relabeling and training may see of a dataset: observations, actions, ends and states; no rewards."""
+    digests = [
+        artifacts.hash_arrays(episode.obs, episode.actions, np.array([episode.terminated]), states)
+        for episode, states in zip(read_episodes(dataset_id), read_states(dataset_id), strict=True)
+    ]
+    return artifacts.hash_json(digests)

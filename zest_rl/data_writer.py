@@ -1,0 +1,245 @@
+"""Episodes → Minari datasets: staged, verified, locked and renamed once; nothing is ever half written.
+
+The layout on disk is drawn in `zest_rl.data`, the alignment of the arrays in `zest_rl.types`.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import shutil
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl import artifacts
+from zest_rl.data import DATA_FILE, MANIFEST_FILE, METADATA_FILE, dataset_path, exists, read_episodes, read_metadata
+from zest_rl.errors import BadInput, ZestError
+from zest_rl.types import FloatArray
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One collected episode, everything that is stored of it (T steps)."""
+
+    seed: int
+    obs: FloatArray
+    """(T+1, obs_dim) float32."""
+    actions: FloatArray
+    """(T, act_dim) float32."""
+    terminated: bool
+    qpos: NDArray[np.float64]
+    """(T+1, nq) simulator positions; frames are rendered from them."""
+    qvel: NDArray[np.float64]
+    """(T+1, nv) simulator velocities."""
+    gt_reward: FloatArray
+    """(T+1,) float32; the first belongs to the reset."""
+    gt_success: NDArray[np.bool_]
+    """(T+1,) bool."""
+
+
+def _in_child(build: Callable[..., None], *args: object) -> None:
+    """Run an HDF5 write in a process of its own: on a full disk the library kills its process."""
+    context = multiprocessing.get_context("spawn")
+    receive, send = context.Pipe(duplex=False)
+    child = context.Process(target=_report_errors, args=(send, build, *args))
+    child.start()
+    send.close()
+    try:
+        message = receive.recv()
+    except EOFError:
+        message = "the writing process died; is the disk full?"
+    child.join()
+    if message is not None:
+        raise ZestError(f"the dataset could not be written: {message}. Nothing was left behind; try again")
+
+
+def _report_errors(send: Any, build: Callable[..., None], *args: object) -> None:
+    try:
+        build(*args)
+    except Exception as error:
+        send.send(f"{type(error).__name__}: {error}")
+    else:
+        send.send(None)
+
+
+def _set_metadata(path: Path, **values: object) -> None:
+    metadata = artifacts.read_json(path)
+    metadata.update(values)
+    artifacts.write_json(path, metadata)
+
+
+def _publish(staging: Path, dataset_id: str, n_steps: Sequence[int]) -> None:
+    """Check a staged dataset against what was meant to be written, and write its manifest."""
+    with h5py.File(staging / DATA_FILE, "r") as file:
+        lengths = [len(file[f"episode_{i}"]["rewards"]) for i in range(len(file))]
+        if lengths != list(n_steps):
+            raise ZestError(f"dataset {dataset_id} was not written whole ({len(lengths)} of {len(n_steps)} episodes)")
+    digests = {name: artifacts.hash_file(staging / name) for name in (DATA_FILE, METADATA_FILE)}
+    artifacts.write_json(staging / MANIFEST_FILE, digests)
+
+
+def _build_new(root: Path, dataset_id: str, recordings: Sequence[Recording], fields: Mapping[str, Any]) -> None:
+    os.environ["MINARI_DATASETS_PATH"] = str(root)  # of this child process only
+    import gymnasium
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    spec = gymnasium.envs.registration.EnvSpec.from_json(fields["env_spec"])
+    buffers = []
+    for i, recording in enumerate(recordings):
+        n_steps = len(recording.actions)
+        ends = np.zeros(n_steps, dtype=bool)
+        ends[-1] = True
+        buffers.append(
+            EpisodeBuffer(
+                id=i,
+                seed=recording.seed,
+                observations=recording.obs,
+                actions=recording.actions,
+                rewards=recording.gt_reward[1:],
+                terminations=ends & recording.terminated,
+                truncations=ends & (not recording.terminated),
+                infos={
+                    "state": {"qpos": recording.qpos, "qvel": recording.qvel},
+                    "gt": {"reward": recording.gt_reward, "success": recording.gt_success},
+                },
+            )
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Minari warns of every optional field that is not given
+        minari.create_dataset_from_buffers(
+            dataset_id,
+            buffers,
+            env=spec,
+            eval_env=spec,
+            ref_min_score=fields["ref_min_score"],
+            ref_max_score=fields["ref_max_score"],
+            algorithm_name=fields["algorithm_name"],
+            description=fields["description"],
+        )
+
+
+def write_dataset(
+    dataset_id: str,
+    recordings: Sequence[Recording],
+    *,
+    env_spec: str,
+    ref_min_score: float,
+    ref_max_score: float,
+    algorithm_name: str,
+    description: str,
+    zest: Mapping[str, Any],
+) -> Path:
+    """Write collected episodes as a new Minari dataset; rewards are the ground truth until it is relabeled.
+
+    Args:
+        dataset_id: ``namespace/name-vN``; must not exist.
+        recordings: the episodes.
+        env_spec: Gymnasium EnvSpec as JSON.
+        ref_min_score: ground-truth return of the robot doing nothing (0 on the normalized scale).
+        ref_max_score: mean ground-truth return of the expert (100 on the normalized scale).
+        algorithm_name: what acted.
+        description: one paragraph for readers.
+        zest: how the dataset was made; kept in the metadata.
+
+    Returns:
+        The dataset's folder.
+
+    Raises:
+        BadInput: bad id, or a dataset of this id exists.
+        ZestError: the disk is full or read-only; nothing is left behind.
+    """
+    final = dataset_path(dataset_id)
+    fields = {
+        "env_spec": env_spec,
+        "ref_min_score": ref_min_score,
+        "ref_max_score": ref_max_score,
+        "algorithm_name": algorithm_name,
+        "description": description,
+    }
+    with artifacts.lock(final):
+        if exists(dataset_id):
+            raise BadInput(f"dataset {dataset_id} exists already; choose another name or delete {final}")
+        n_bytes = sum(r.obs.nbytes + r.actions.nbytes + r.qpos.nbytes + r.qvel.nbytes for r in recordings)
+        artifacts.check_free_space(final.parent, 2 * n_bytes)
+        with artifacts.staged_folder(final) as staging:
+            _in_child(_build_new, staging / "root", dataset_id, recordings, fields)
+            (staging / "root" / dataset_id / "data").rename(staging / "data")
+            shutil.rmtree(staging / "root")
+            _set_metadata(staging / METADATA_FILE, zest=dict(zest))
+            _publish(staging, dataset_id, [len(r.actions) for r in recordings])
+    return final
+
+
+def _rewrite_rewards(path: Path, rewards: Sequence[FloatArray], scores: Sequence[FloatArray]) -> None:
+    with h5py.File(path, "r+") as file:
+        for i, (reward, score) in enumerate(zip(rewards, scores, strict=True)):
+            group = file[f"episode_{i}"]
+            del group["rewards"]
+            group["rewards"] = reward
+            infos = group.require_group("infos")
+            if "zest" in infos:
+                del infos["zest"]
+            infos["zest/score"] = score
+
+
+def write_relabeled(
+    source_id: str,
+    dataset_id: str,
+    rewards: Sequence[FloatArray],
+    scores: Sequence[FloatArray],
+    *,
+    description: str,
+    zest: Mapping[str, Any],
+    extra: Callable[[Path], None],
+) -> Path:
+    """Write a copy of a dataset with other rewards; everything else, ground truth included, stays bit for bit.
+
+    Args:
+        source_id: the dataset to copy.
+        dataset_id: the new id; must not exist.
+        rewards: (T,) float32 per episode.
+        scores: (T+1,) float32 per episode, kept as ``infos/zest/score``.
+        description: appended to the source's description.
+        zest: provenance, kept in the metadata beside the source's own.
+        extra: called with the staged folder, to leave further files in it.
+
+    Returns:
+        The new dataset's folder.
+
+    Raises:
+        BadInput: the new id exists; lengths do not fit; a value is not finite.
+        ZestError: the disk is full or read-only; nothing is left behind.
+    """
+    source, final = dataset_path(source_id), dataset_path(dataset_id)
+    metadata = read_metadata(source_id)
+    n_steps = [len(episode) for episode in read_episodes(source_id)]
+    if [len(r) for r in rewards] != n_steps or [len(s) for s in scores] != [n + 1 for n in n_steps]:
+        raise BadInput("rewards must have length T and scores length T+1 for every episode of the source dataset")
+    if not all(np.isfinite(array).all() for array in (*rewards, *scores)):
+        raise BadInput("rewards and scores must be finite, got NaN or infinity")
+    with artifacts.lock(final):
+        if exists(dataset_id):
+            raise BadInput(f"dataset {dataset_id} exists already; choose another name or delete {final}")
+        artifacts.check_free_space(final.parent, 2 * (source / DATA_FILE).stat().st_size)
+        with artifacts.staged_folder(final) as staging:
+            (staging / "data").mkdir()
+            shutil.copyfile(source / DATA_FILE, staging / DATA_FILE)
+            shutil.copyfile(source / METADATA_FILE, staging / METADATA_FILE)
+            _in_child(_rewrite_rewards, staging / DATA_FILE, rewards, scores)
+            _set_metadata(
+                staging / METADATA_FILE,
+                dataset_id=dataset_id,
+                description=f"{metadata.get('description', '')} {description}".strip(),
+                zest={**metadata.get("zest", {}), **zest},
+            )
+            extra(staging)
+            _publish(staging, dataset_id, n_steps)
+    return final

@@ -1,0 +1,211 @@
+"""Frozen networks that turn frames or sentences into vectors, chosen by a URI.
+
+| URI | weights |
+|---|---|
+| `efficientnet-lite0` | ImageNet weights that are installed with this package: no download, and the default |
+| `open_clip:MODEL/TAG` | open_clip's hub; reads sentences too |
+| `torchvision:resnet50`, `torchvision:resnet50/WEIGHTS` | torchvision's hub; likewise resnet18, 34, 101, 152 |
+| `timm:NAME` | timm's hub |
+| `open_clip:MODEL@/path`, `open_clip:MODEL/TAG@/path`, and so on for the three above | a local checkpoint file |
+| `moco:/path` | a pre-training checkpoint of MoCo v2 (ResNet50) |
+
+With `@/path` the name still chooses architecture, activation and preprocessing, so keep the TAG when the file holds a
+tag's weights. A checkpoint is a `.safetensors` file or one that `torch.load(weights_only=True)` reads, and it must fill
+every parameter (but a classification head, which is cut off): nothing here ever runs on random weights. Images go
+through each model's own preprocessing.
+
+Torch is imported when a network is needed, and not before: the default embedder tells its `fingerprint` and `dim`
+without it, so that work on cached embeddings starts at once.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
+
+import numpy as np
+
+from zest_rl.artifacts import hash_arrays, hash_file, hash_json
+from zest_rl.embedders.checkpoints import DEFAULT_EMBEDDER, LITE0_PREPROCESSING, installed_weights
+from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.types import FloatArray, Frame
+
+if TYPE_CHECKING:
+    import torch
+
+    from zest_rl.embedders.networks import Network
+
+__all__ = ["DEFAULT_EMBEDDER", "Embedder", "Precision", "load_embedder"]
+
+Precision = Literal["auto", "fp32", "bf16"]
+
+
+class Embedder(Protocol):
+    """A frozen network ψ. Equal inputs give equal vectors to about 1e-6, not to the bit."""
+
+    @property
+    def uri(self) -> str:
+        """What `load_embedder` was asked for."""
+
+    @property
+    def fingerprint(self) -> str:
+        """64 hex digits over network, weights, preprocessing and precision; not over device or batch size."""
+
+    @property
+    def dim(self) -> int:
+        """Length D of a vector."""
+
+    @property
+    def reads_text(self) -> bool:
+        """Whether `embed_texts` works."""
+
+    def embed_images(self, frames: Sequence[Frame]) -> FloatArray:
+        """Embed frames of any sizes, each (H, W, 3) uint8 RGB, as (N, D) float32 that is not normalised.
+
+        Raises:
+            BadInput: a frame has another shape or dtype.
+            ZestError: the network returned NaN or infinity.
+        """
+
+    def embed_texts(self, sentences: Sequence[str]) -> FloatArray:
+        """Embed sentences as (N, D) float32 that is not normalised, in the space of the images.
+
+        Raises:
+            BadInput: this network reads no text.
+            ZestError: the network returned NaN or infinity, or its tokenizer cannot be had.
+        """
+
+
+def load_embedder(
+    uri: str,
+    *,
+    device: str = "auto",
+    precision: Precision = "auto",
+    batch_size: int = 16,
+) -> Embedder:
+    """Return the embedder that `uri` names (see the table above).
+
+    Args:
+        uri: the embedder.
+        device: "auto" (CUDA where there is one, else the CPU), "cpu", "cuda", "cuda:1", "mps".
+        precision: of weights and activations; "auto" is bf16 where the hardware computes it natively, else fp32.
+        batch_size: frames or sentences per forward pass.
+
+    Raises:
+        BadInput: unknown family, model, tag or device; a checkpoint that cannot be read or does not fit the model.
+        ZestError: the weights are neither cached nor can they be fetched.
+    """
+    if precision not in get_args(Precision):
+        raise BadInput(f"unknown precision {precision!r}; {nearest(precision, get_args(Precision))}")
+    if batch_size < 1:
+        raise BadInput(f"batch_size must be at least 1, got {batch_size}")
+    _check_device(device)
+    bf16 = precision == "bf16" or (precision == "auto" and _computes_bf16(device))
+
+    if uri == DEFAULT_EMBEDDER:
+        weights = installed_weights()
+
+        def load_lite0() -> Network:
+            from zest_rl.embedders.networks import build_lite0
+
+            return _place(build_lite0(weights), device, bf16)
+
+        fingerprint = hash_json([uri, hash_file(weights), LITE0_PREPROCESSING, bf16])
+        return _NetworkEmbedder(uri, fingerprint, 1280, False, batch_size, load_lite0)
+
+    from zest_rl.embedders.networks import build
+
+    network = build(uri)
+    fingerprint = _fingerprint(uri, network, bf16)
+    _place(network, device, bf16)
+    reads_text = network.encode_texts is not None
+    return _NetworkEmbedder(uri, fingerprint, network.dim, reads_text, batch_size, lambda: network)
+
+
+@dataclass(frozen=True)
+class _NetworkEmbedder:
+    """The one implementation of `Embedder`; the network is loaded when first used."""
+
+    uri: str
+    fingerprint: str
+    dim: int
+    reads_text: bool
+    batch_size: int
+    load: Callable[[], Network]
+
+    @cached_property
+    def _network(self) -> Network:
+        return self.load()
+
+    def embed_images(self, frames: Sequence[Frame]) -> FloatArray:
+        for i, frame in enumerate(frames):
+            if frame.ndim != 3 or frame.shape[2] != 3 or 0 in frame.shape or frame.dtype != np.uint8:
+                raise BadInput(
+                    f"frame {i} must have shape (H, W, 3) and dtype uint8, "
+                    f"got shape {frame.shape} and dtype {frame.dtype}"
+                )
+        return self._embed(frames, self._network.embed_frames, "frame")
+
+    def embed_texts(self, sentences: Sequence[str]) -> FloatArray:
+        encode = self._network.encode_texts if self.reads_text else None
+        if encode is None:
+            raise BadInput(f"{self.uri} reads images only; for sentences use one like open_clip:ViT-B-32/openai")
+        return self._embed(list(sentences), encode, "sentence")
+
+    def _embed(self, items: Sequence[Any], encode: Callable[[Any], torch.Tensor], what: str) -> FloatArray:
+        import torch
+
+        vectors = np.empty((len(items), self.dim), np.float32)
+        with torch.inference_mode():
+            for start in range(0, len(items), self.batch_size):
+                batch = slice(start, start + self.batch_size)
+                vectors[batch] = encode(items[batch]).float().cpu().numpy()
+        bad = np.flatnonzero(~np.isfinite(vectors).all(axis=1))
+        if len(bad):
+            raise ZestError(
+                f"{self.uri} returned NaN or infinity for {len(bad)} of {len(items)} {what}s (the first is {what} "
+                f"{bad[0]}); try precision fp32, and if that does not help use other weights, for these are broken"
+            )
+        return vectors
+
+
+def _check_device(device: str) -> None:
+    if device in ("auto", "cpu"):
+        return  # needs no torch
+    if not re.fullmatch(r"cuda(:\d+)?|mps", device):
+        raise BadInput(f"unknown device {device!r}; {nearest(device, ('auto', 'cpu', 'cuda', 'cuda:0', 'mps'))}")
+    import torch
+
+    index = int(device.partition(":")[2] or 0)
+    there = torch.backends.mps.is_available() if device == "mps" else index < torch.cuda.device_count()
+    if not there:
+        raise BadInput(f"torch finds no device {device!r} on this machine; use 'auto' or 'cpu'")
+
+
+def _computes_bf16(device: str) -> bool:
+    """Tell whether the hardware computes bf16 natively; without torch, for fingerprints must not wait for it."""
+    if device.startswith("cuda") or (device == "auto" and Path("/proc/driver/nvidia/gpus").is_dir()):
+        return True
+    cpu = Path("/proc/cpuinfo")
+    flags = set(re.findall(r"\w+", cpu.read_text())) if cpu.is_file() else set()
+    return device != "mps" and bool(flags & {"avx512_bf16", "amx_bf16", "bf16"})
+
+
+def _place(network: Network, device: str, bf16: bool) -> Network:
+    import torch
+
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    return network.place(device, torch.bfloat16 if bf16 else torch.float32)
+
+
+def _fingerprint(uri: str, network: Network, bf16: bool) -> str:
+    """Hash the loaded weights, so that a copy of a checkpoint in another file or format gives the same."""
+    state = network.module.state_dict()
+    weights = [list(state), hash_arrays(*(value.numpy() for value in state.values()))]
+    layout = [re.sub(r" at 0x[0-9a-f]+", "", repr(part)) for part in (network.module, network.preprocess)]
+    return hash_json([uri.partition(":")[0], weights, layout, bf16])

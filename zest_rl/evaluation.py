@@ -1,0 +1,281 @@
+"""Policy + environment (+ scorer for the online return-to-go) → episode results. Imports no training.
+
+Episodes run in lockstep, `EPISODES_PER_JOB` at a time, one job per core; every policy meets the same starts (paired
+seeds). The Decision Transformer's return-to-go falls by the *online ZeST score* of each new state, in the units of the
+rewards it was trained on; ground-truth rewards are recorded and shown to nobody.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl import artifacts
+from zest_rl.agents import Policy, load_policy
+from zest_rl.errors import BadInput, ZestError
+from zest_rl.metrics import bootstrap, iqm, normalized_return, wilson
+from zest_rl.parallel import chunks, concatenate, map_jobs, one_thread, read_arrays
+from zest_rl.relabel import SCORER_FILE, Reward
+from zest_rl.scorer import Scorer
+from zest_rl.types import EpisodeResult
+
+Rtg = Literal["online", "constant", "schedule"]
+EPISODES_PER_JOB = 25
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """What is run. Two evaluations with equal seeds start from equal states."""
+
+    n_episodes: int = 50
+    seed: int = 1_000_000
+    """Episode i resets the environment with seed + i; datasets use other seeds."""
+    rtg: Rtg = "online"
+    """How the return-to-go falls: by the online ZeST score, not at all, or as in the best training episode."""
+    target_quantile: float = 1.0
+    """The target return is this quantile of the training returns: a rule fixed before evaluation."""
+
+    def __post_init__(self) -> None:
+        problems = []
+        if self.n_episodes < 1:
+            problems.append(f"n_episodes must be at least 1, got {self.n_episodes}")
+        if self.seed < 0:
+            problems.append(f"seed must be at least 0, got {self.seed}")
+        if not 0 <= self.target_quantile <= 1:
+            problems.append(f"target_quantile must be in [0, 1], got {self.target_quantile}")
+        if problems:
+            raise BadInput("; ".join(problems))
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The result for one trained policy."""
+
+    run: Path
+    config: EvaluationConfig
+    target_return: float | None
+    """Return that the policy was asked for; None for policies without one."""
+    minimum: float
+    expert: float
+    """Ground-truth returns that are 0 % and 100 %."""
+    episodes: tuple[EpisodeResult, ...]
+    traces: Arrays
+    """gt_reward (N, T+1), qpos (N, T+1, nq) and, when scored online, score (N, T+1)."""
+
+    def normalized(self) -> NDArray[np.float64]:
+        """Normalized return of each episode, in percent: (N,)."""
+        return normalized_return(np.array([e.gt_return for e in self.episodes]), self.minimum, self.expert)
+
+    def summary(self) -> dict[str, Any]:
+        """JSON-ready: mean with its interval, IQM, success rate."""
+        values = self.normalized()
+        success = wilson(sum(e.success for e in self.episodes), len(self.episodes))
+        return {
+            "normalized_return": asdict(bootstrap([values])),
+            "iqm": iqm(values),
+            "success": asdict(success),
+            "n_episodes": len(self.episodes),
+            "target_return": self.target_return,
+        }
+
+
+def target_return(policy: Policy, config: EvaluationConfig) -> float | None:
+    """Return what a return-conditioned policy is asked for: a quantile of its training returns; else None."""
+    if not policy.uses_return:
+        return None
+    quantiles = np.asarray(policy.meta["return_quantiles"], dtype=np.float64)
+    return float(np.interp(config.target_quantile, np.linspace(0, 1, len(quantiles)), quantiles))
+
+
+def uses_online_scores(policy: Policy, config: EvaluationConfig) -> bool:
+    """Whether each new state has to be scored while the policy acts."""
+    return policy.uses_return and config.rtg == "online" and _reward_kind(policy) is not None
+
+
+def _reward_kind(policy: Policy) -> Reward | None:
+    """How the rewards that the policy was trained on follow from scores; None when they are not ZeST scores."""
+    relabel = policy.meta["dataset"]["zest"].get("relabel")
+    return None if relabel is None else relabel["reward"]
+
+
+def rollout(
+    policy: Policy, env_spec: str, seeds: range, config: EvaluationConfig, scorer: Scorer | None = None
+) -> Arrays:
+    """Run one episode per seed, in lockstep.
+
+    Args:
+        policy: acts on all episodes at once.
+        env_spec: Gymnasium EnvSpec as JSON.
+        seeds: of the environments' resets.
+        config: how the return-to-go falls.
+        scorer: scores each new state; needed for ``rtg="online"`` with ZeST rewards.
+
+    Returns:
+        gt_reward (N, T+1) float32, gt_success (N, T+1) bool, qpos (N, T+1, nq), n_steps (N,), score (N, T+1) if scored.
+
+    Raises:
+        ZestError: the policy was trained on ground-truth rewards and ``rtg="online"`` is asked for with no scorer; its
+            return-to-go then falls by the environment's reward (the upper bound of the comparison).
+    """
+    spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
+    envs = [gymnasium.make(spec) for _ in seeds]
+    resets = [env.reset(seed=seed) for env, seed in zip(envs, seeds, strict=True)]
+    obs = np.stack([o for o, _ in resets])
+    infos = [info for _, info in resets]
+    policy.begin(len(envs), target_return(policy, config))
+    trace: dict[str, list[Any]] = {"gt_reward": [], "gt_success": [], "qpos": []}
+    first = np.stack([info["state"]["qpos"] for info in infos])
+    scores = [scorer.score_now(first, first)] if scorer is not None else []
+    horizon = spec.max_episode_steps
+    if horizon is None:
+        raise ZestError("the environment has no max_episode_steps; scores are summed over a fixed horizon")
+
+    def record() -> None:
+        trace["gt_reward"].append(np.array([info["gt"]["reward"] for info in infos]))
+        trace["gt_success"].append(np.array([info["gt"]["success"] for info in infos]))
+        trace["qpos"].append(np.stack([info["state"]["qpos"] for info in infos]))
+
+    record()
+    for step in range(horizon):
+        actions = policy.act(obs)
+        results = [env.step(action) for env, action in zip(envs, actions, strict=True)]
+        obs = np.stack([result[0] for result in results])
+        rewards = np.array([result[1] for result in results], dtype=np.float32)
+        infos = [result[4] for result in results]
+        record()
+        if scorer is not None:
+            scores.append(scorer.score_now(first, trace["qpos"][-1]))
+            level = _reward_kind(policy) != "difference"
+            rewards = scores[-1] if level else scores[-1] - scores[-2]
+        if policy.uses_return:
+            policy.observe(_decrement(policy, config, step, rewards))
+    for env in envs:
+        env.close()
+    arrays = {name: np.stack(values, axis=1) for name, values in trace.items()}
+    if scorer is not None:
+        arrays["score"] = np.stack(scores, axis=1)
+    return arrays
+
+
+def _decrement(
+    policy: Policy, config: EvaluationConfig, step: int, rewards: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """By how much the return-to-go of each episode falls after `step`."""
+    if config.rtg == "constant":
+        return np.zeros_like(rewards)
+    if config.rtg == "schedule":
+        schedule = np.asarray(policy.meta["rtg_schedule"], dtype=np.float32)
+        return np.full_like(rewards, schedule[step] - schedule[step + 1] if step + 1 < len(schedule) else 0.0)
+    return rewards
+
+
+@functools.lru_cache(maxsize=2)
+def _scorer(path: Path) -> Scorer:
+    return Scorer.load(path, n_workers=1)
+
+
+def _evaluate_part(job: tuple[Path, EvaluationConfig, range, bool, str]) -> Arrays:
+    run, config, seeds, scored, device = job
+    policy = load_policy(run, device=device)
+    scorer = _scorer(run / SCORER_FILE) if scored else None
+    with one_thread():
+        arrays = rollout(policy, policy.meta["dataset"]["env_spec"], seeds, config, scorer)
+    if scorer is not None:
+        scorer.states.flush()
+    return arrays
+
+
+def evaluate(
+    run: Path,
+    config: EvaluationConfig,
+    *,
+    score: bool = False,
+    device: str = "cpu",
+    n_workers: int | None = None,
+    on_progress: Callable[[int], None] | None = None,
+) -> Evaluation:
+    """Evaluate the last checkpoint of a run; finished parts are kept, so a cut evaluation goes on where it stopped.
+
+    Args:
+        run: folder that `zest_rl.training.train` left, with the dataset's entry in its meta.
+        config: seeds and return-to-go.
+        score: also record ZeST scores where the policy does not need them.
+        device: where the policy runs.
+        n_workers: number of processes, default one per core.
+        on_progress: called with the number of episodes that were finished.
+
+    Raises:
+        BadInput: the run was not trained to its end, or has no scorer although scores are asked for.
+        ZestError: a part of the run is damaged.
+    """
+    run = run.resolve()
+    policy = load_policy(run, device=device)
+    scored = score or uses_online_scores(policy, config)
+    if scored and not (run / SCORER_FILE).exists():
+        raise BadInput(
+            f"scores are needed, but {run.name} has no {SCORER_FILE}: it was not trained on a relabeled dataset; "
+            "use --rtg constant, or train on the output of `zest relabel`"
+        )
+    folder = evaluation_folder(run, config)
+    jobs = {}
+    for part in chunks(config.n_episodes, EPISODES_PER_JOB):
+        seeds = range(config.seed + part.start, config.seed + part.stop)
+        jobs[f"seeds-{seeds.start}-{seeds.stop}{'-scored' if scored else ''}"] = (run, config, seeds, scored, device)
+    map_jobs(
+        _evaluate_part,
+        jobs,
+        folder / "parts",
+        n_workers=n_workers,
+        on_done=None if on_progress is None else lambda name: on_progress(len(jobs[name][2])),
+    )
+    parts = [read_arrays(folder / "parts" / f"{name}.npz") for name in jobs]
+    traces = concatenate([part for part in parts if part is not None])
+    dataset = policy.meta["dataset"]
+    result = Evaluation(
+        run,
+        config,
+        target_return(policy, config),
+        dataset["ref_min_score"],
+        dataset["ref_max_score"],
+        _episode_results(traces, config),
+        traces,
+    )
+    artifacts.write_json(
+        folder / "result.json",
+        {
+            "config": asdict(config),
+            "agent": policy.agent,
+            "references": {"minimum": result.minimum, "expert": result.expert},
+            "summary": result.summary(),
+            "episodes": [asdict(episode) for episode in result.episodes],
+            "provenance": artifacts.provenance(),
+        },
+    )
+    return result
+
+
+def evaluation_folder(run: Path, config: EvaluationConfig) -> Path:
+    """Where `evaluate` leaves its parts, ``result.json`` and videos."""
+    return run / "evaluations" / artifacts.hash_json(asdict(config))[:8]
+
+
+def _episode_results(traces: Arrays, config: EvaluationConfig) -> tuple[EpisodeResult, ...]:
+    n_episodes, n_frames = traces["gt_reward"].shape
+    return tuple(
+        EpisodeResult(
+            seed=config.seed + i,
+            gt_return=float(traces["gt_reward"][i, 1:].sum(dtype=np.float64)),
+            success=bool(traces["gt_success"][i].any()),
+            n_steps=n_frames - 1,
+            zest_return=float(traces["score"][i, 1:].sum(dtype=np.float64)) if "score" in traces else None,
+        )
+        for i in range(n_episodes)
+    )

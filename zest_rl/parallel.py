@@ -1,0 +1,129 @@
+"""Work in chunks: one process per core, one file per finished chunk, so that a cut run goes on where it stopped."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl import artifacts
+from zest_rl.errors import ZestError
+
+Job = TypeVar("Job")
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def n_cores() -> int:
+    """Return the number of CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _start_worker() -> None:
+    """Keep each worker on one core: results then do not depend on the number of workers, and none waits for another."""
+    os.environ["OMP_NUM_THREADS"] = os.environ["MKL_NUM_THREADS"] = "1"
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch on one thread within the context: its results depend on the number of threads in the last digits."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
+    """Read an ``.npz`` file whole, or return None when it is missing or damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def write_arrays(path: Path, arrays: Arrays) -> None:
+    """Write an ``.npz`` file atomically."""
+    artifacts.check_free_space(path.parent, sum(array.nbytes for array in arrays.values()))
+    with artifacts.atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, allow_pickle=False, **dict(arrays))
+
+
+def _run_job(work: Callable[[Job], Arrays], job: Job, path: Path) -> None:
+    write_arrays(path, work(job))
+
+
+def map_jobs(
+    work: Callable[[Job], Arrays],
+    jobs: Mapping[str, Job],
+    folder: Path,
+    *,
+    n_workers: int | None = None,
+    on_done: Callable[[str], None] | None = None,
+) -> None:
+    """Leave the arrays of ``work(job)`` in ``folder/NAME.npz`` for every job; what is there already is not done again.
+
+    Args:
+        work: a module-level function (it is sent to worker processes); it must depend on nothing but its job.
+        jobs: name → job. The name must identify the job's content.
+        folder: where results are left.
+        n_workers: number of processes, default one per core. With one (or one job), work is done in this process.
+        on_done: called with the name of each job when its file is there, also for those found finished.
+
+    Raises:
+        ZestError: a worker process died (out of memory, killed). What was finished is kept.
+    """
+    missing = []
+    for name in jobs:
+        if read_arrays(folder / f"{name}.npz") is None:
+            missing.append(name)
+        elif on_done is not None:
+            on_done(name)
+    n_workers = min(n_workers or n_cores(), len(missing))
+    if n_workers <= 1:
+        for name in missing:
+            _run_job(work, jobs[name], folder / f"{name}.npz")
+            if on_done is not None:
+                on_done(name)
+        return
+    context = multiprocessing.get_context("spawn")  # fork is unsafe beside torch's and the GL library's threads
+    with ProcessPoolExecutor(n_workers, mp_context=context, initializer=_start_worker) as pool:
+        pending = {pool.submit(_run_job, work, jobs[name], folder / f"{name}.npz"): name for name in missing}
+        try:
+            while pending:
+                done, _ = wait(pending, return_when=FIRST_COMPLETED)
+                for future in done:
+                    name = pending.pop(future)
+                    future.result()
+                    if on_done is not None:
+                        on_done(name)
+        except BrokenProcessPool as error:
+            raise ZestError(
+                f"a worker process died while {len(pending) + 1} of {len(jobs)} parts were open (killed, or out of "
+                "memory); finished parts are kept, run the same command again to go on"
+            ) from error
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+def chunks(n: int, size: int) -> list[range]:
+    """Split ``range(n)`` into ranges of at most `size`."""
+    return [range(start, min(start + size, n)) for start in range(0, n, size)]
+
+
+def concatenate(parts: Sequence[Arrays]) -> dict[str, NDArray[Any]]:
+    """Join equally named arrays of several parts along the first axis."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

@@ -1,0 +1,109 @@
+"""Scores → a relabeled Minari dataset with provenance, under a name that is a hash of how it was scored."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from zest_rl import artifacts, data
+from zest_rl.data_writer import write_relabeled
+from zest_rl.errors import BadInput, nearest
+from zest_rl.scorer import Scorer, ScorerConfig
+from zest_rl.types import FloatArray
+
+Reward = Literal["level", "difference"]
+SCORER_FILE = "zest_scorer.safetensors"
+
+
+@dataclass(frozen=True)
+class Relabeled:
+    """What `relabel` made or found."""
+
+    dataset_id: str
+    path: Path
+    scorer: Scorer
+    n_frames: int
+    n_still: int | None
+    """Frames without any change against their first frame; None when the dataset was there already."""
+    already_there: bool
+
+
+def rewards_from_scores(scores: FloatArray, reward: Reward = "level") -> FloatArray:
+    """Turn the scores of T+1 frames into the rewards of T actions (alignment: `zest_rl.types`).
+
+    Args:
+        scores: (T+1,) φ of x_0 … x_T.
+        reward: ``"level"``, r_t = φ_{t+1}, as in the paper; or ``"difference"``, r_t = φ_{t+1} − φ_t.
+
+    Returns:
+        (T,) float32.
+    """
+    if reward == "level":
+        return scores[1:]
+    if reward == "difference":
+        return np.diff(scores)
+    raise BadInput(f"unknown reward {reward!r}; {nearest(reward, ('level', 'difference'))}")
+
+
+def relabeled_id(source_id: str, digest: str) -> str:
+    """``zest/kitchen-micro-noisy-v0`` → ``zest/kitchen-micro-noisy-zest-1a2b3c4d-v0``."""
+    return re.sub(r"-v(\d+)$", rf"-zest-{digest[:8]}-v\1", source_id)
+
+
+def relabel(
+    source_id: str,
+    config: ScorerConfig,
+    *,
+    reward: Reward = "level",
+    device: str = "auto",
+    n_workers: int | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> Relabeled:
+    """Write a copy of a dataset whose rewards are ZeST scores; the ground truth stays in the infos, unread.
+
+    Args:
+        source_id: a dataset with recorded simulator state.
+        config: the scorer.
+        reward: the level of the score at each step, or its change.
+        device: where the embedder runs.
+        n_workers: processes that render and embed, default one per core.
+        on_progress: called with (parts embedded, parts in all).
+
+    Raises:
+        BadInput: the dataset, goal or embedder is not there or does not fit.
+        ZestError: the disk is full or read-only; nothing is left behind.
+    """
+    states = data.read_states(source_id)
+    scorer = Scorer.build(config, states[0][0], device=device, n_workers=n_workers)
+    source_fingerprint = data.fingerprint(source_id)
+    digest = artifacts.hash_json([source_fingerprint, scorer.fingerprint(), reward])
+    target_id = relabeled_id(source_id, digest)
+    path = data.dataset_path(target_id)
+    n_frames = sum(map(len, states))
+    if data.exists(target_id):
+        return Relabeled(target_id, path, scorer, n_frames, None, already_there=True)
+    scores, n_still = scorer.score_episodes(states, on_progress)
+    write_relabeled(
+        source_id,
+        target_id,
+        [rewards_from_scores(score, reward) for score in scores],
+        scores,
+        description=f"Rewards are ZeST scores ({config.similarity}+{config.features}, {reward}) by {config.embedder}.",
+        zest={
+            "relabel": {
+                "source": source_id,
+                "source_sha256": source_fingerprint,
+                "reward": reward,
+                "scorer": scorer.describe(),
+                "n_still_frames": n_still,
+                "provenance": artifacts.provenance(),
+            }
+        },
+        extra=lambda folder: scorer.save(folder / SCORER_FILE),
+    )
+    return Relabeled(target_id, path, scorer, n_frames, n_still, already_there=False)

@@ -1,0 +1,11 @@
+"""Results → one self-contained HTML file, for people who choose a reward by looking.
+
+`data` holds what a report says, `charts` draws it as SVG, `page` puts both into `template.html`.
+"""
+
+from zest_rl.report.data import Curve, EpisodePanel, GoalPanel, MethodRow, Report, Scatter
+from zest_rl.report.page import render_html, write_report
+
+__all__ = [
+    "Curve", "EpisodePanel", "GoalPanel", "MethodRow", "Report", "Scatter", "render_html", "write_report",
+]  # fmt: skip

@@ -1,0 +1,167 @@
+"""What a report says: frozen dataclasses, checked where they are built.
+
+Returns are normalized: 100 % is the expert, 0 % is the robot that does nothing. A figure that could not be computed is
+NaN and is shown as "–".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from zest_rl.errors import BadInput, nearest
+from zest_rl.types import FloatArray, Frame
+
+Kind = Literal["dataset", "method", "control"]
+
+
+def _check_equal_lengths(what: str, lengths: Mapping[str, int]) -> None:
+    if len(set(lengths.values())) > 1:
+        got = ", ".join(f"{name} {n}" for name, n in lengths.items())
+        raise BadInput(f"{what}: {' and '.join(lengths)} must be equally long, got {got}; pass one value for each step")
+
+
+@dataclass(frozen=True)
+class MethodRow:
+    """One row of the results table."""
+
+    method: str
+    mean: float
+    """Mean normalized return, in %."""
+    ci_low: float
+    """Lower end of the 95 % confidence interval of `mean`, in %."""
+    ci_high: float
+    """Upper end, in %."""
+    iqm: float
+    """Interquartile mean of the normalized returns, in %."""
+    success_rate: float
+    """Share of successful episodes, in [0, 1]."""
+    n_seeds: int
+    n_episodes: int
+    """Evaluated episodes, over all seeds."""
+    kind: Kind = "method"
+    """`dataset`: the demonstrations; `method`: what is compared; `control`: what must do worse or is a bound."""
+    note: str = ""
+    paper_value: float | None = None
+    """The paper's mean normalized return, in %; None when the paper has no such figure."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(Kind):
+            raise BadInput(f"{self.method}: unknown kind {self.kind!r}; {nearest(self.kind, get_args(Kind))}")
+
+
+@dataclass(frozen=True)
+class GoalPanel:
+    """How one goal was specified, and how well its ZeST return ranks episodes."""
+
+    name: str
+    start: tuple[Frame | str, ...]
+    """Images (H, W, 3) uint8 RGB, or sentences, of the state at the start."""
+    goal: tuple[Frame | str, ...]
+    """The same for the goal state."""
+    spearman: float | None = None
+    """Rank correlation of ZeST return and ground-truth return, in [-1, 1]; None when not computed."""
+    n_episodes: int = 0
+    """Episodes behind `spearman`."""
+
+    def __post_init__(self) -> None:
+        for item in (*self.start, *self.goal):
+            if not isinstance(item, str) and (item.ndim != 3 or item.shape[2] != 3 or item.dtype != np.uint8):
+                raise BadInput(
+                    f"{self.name}: an image must have shape (H, W, 3) and dtype uint8, "
+                    f"got shape {item.shape} and dtype {item.dtype}; convert it to RGB"
+                )
+
+
+@dataclass(frozen=True)
+class EpisodePanel:
+    """One evaluated episode: its video beside its scores."""
+
+    title: str
+    method: str
+    seed: int
+    normalized_return: float
+    """In %."""
+    success: bool
+    video: Path
+    """MP4 file with H.264 video, which every browser plays; it is embedded."""
+    fps: float
+    """Episode steps per second of video: the frame rate when every step is one frame."""
+    gt_progress: FloatArray
+    """(T+1,) float32, the ground-truth progress of the task's joint in [0, 1]; shown as evaluation only."""
+    scores: FloatArray | None = None
+    """(T+1,) float32, the ZeST score of every frame; None when the policy was not scored."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.fps < math.inf:
+            raise BadInput(
+                f"{self.title}: fps must be positive and finite, got {self.fps}; pass the steps per second of the video"
+            )
+        if len(self.gt_progress) < 2:
+            raise BadInput(
+                f"{self.title}: an episode must have at least 2 frames, got {len(self.gt_progress)}; drop it"
+            )
+        if self.scores is not None:
+            _check_equal_lengths(self.title, {"scores": len(self.scores), "gt_progress": len(self.gt_progress)})
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """ZeST return against ground-truth return, one point for each episode of a dataset."""
+
+    name: str
+    zest_returns: FloatArray
+    """(n,) float32."""
+    gt_returns: FloatArray
+    """(n,) float32."""
+    spearman: float
+    """Rank correlation, in [-1, 1]."""
+    ci: tuple[float, float] | None = None
+    """95 % confidence interval of `spearman`."""
+
+    def __post_init__(self) -> None:
+        _check_equal_lengths(self.name, {"zest_returns": len(self.zest_returns), "gt_returns": len(self.gt_returns)})
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line of a learning curve; curves of the same quantity share a chart."""
+
+    method: str
+    quantity: str
+    """What is drawn upward, with its unit: `validation loss`."""
+    steps: FloatArray
+    """(n,) float32, gradient steps."""
+    values: FloatArray
+    """(n,) float32, the mean over seeds."""
+    low: FloatArray | None = None
+    """(n,) float32, lower edge of the band around `values`; needs `high`."""
+    high: FloatArray | None = None
+    """(n,) float32, upper edge."""
+
+    def __post_init__(self) -> None:
+        if (self.low is None) != (self.high is None):
+            raise BadInput(f"{self.method}: a band needs both low and high, got one of them; pass both or neither")
+        arrays = {"steps": self.steps, "values": self.values, "low": self.low, "high": self.high}
+        _check_equal_lengths(self.method, {name: len(a) for name, a in arrays.items() if a is not None})
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything one HTML file shows. Empty sections are left out."""
+
+    title: str
+    summary_sentence: str
+    table: tuple[MethodRow, ...] = ()
+    goals: tuple[GoalPanel, ...] = ()
+    episodes: tuple[EpisodePanel, ...] = ()
+    scatters: tuple[Scatter, ...] = ()
+    curves: tuple[Curve, ...] = ()
+    details: Mapping[str, object] = field(default_factory=dict)
+    """Configs, versions, provenance: name → anything that reads as JSON; each is a collapsed block."""
+    caveats: tuple[str, ...] = ()

@@ -1,0 +1,203 @@
+"""A goal, an embedder and a ring of views, joined into one object that scores simulator states.
+
+The same scorer relabels a dataset and scores a rollout online. It is saved beside what it made as a small safetensors
+file (the goal's embeddings) with its config, so that neither the goal pictures nor their folder are needed later.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl import artifacts
+from zest_rl.embed import EmbedConfig, StateEmbedder
+from zest_rl.embedders import Precision
+from zest_rl.errors import BadInput, ZestError
+from zest_rl.frames import Views, scene_pair
+from zest_rl.goals import SAME_SCENE, GoalSpec, embed_goal, read_goal
+from zest_rl.parallel import read_arrays, write_arrays
+from zest_rl.scores import Features, Similarity, score_views, zero_deltas
+from zest_rl.tasks import get_task
+from zest_rl.types import FloatArray
+
+
+@dataclass(frozen=True)
+class ScorerConfig:
+    """Everything that a score depends on, besides the states."""
+
+    views: Views
+    goal: str
+    """Goal spec, see `zest_rl.goals`."""
+    embedder: str = "efficientnet-lite0"
+    features: Features = "delta"
+    similarity: Similarity = "cos"
+    precision: Precision = "auto"
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """Rebuild from ``dataclasses.asdict``."""
+        return cls(**{**values, "views": Views(**values["views"])})
+
+
+class Scorer:
+    """Scores simulator states by a goal: φ of `zest_rl.scores`, averaged over goals and views."""
+
+    def __init__(
+        self,
+        config: ScorerConfig,
+        starts: FloatArray,
+        goals: FloatArray,
+        goal_fingerprint: str,
+        *,
+        device: str = "auto",
+        n_workers: int | None = None,
+    ) -> None:
+        """Join the parts; use `Scorer.build` or `Scorer.load`.
+
+        Args:
+            config: what is scored how.
+            starts: (S, D), or (V, S, D) for a goal of its own per view.
+            goals: (K, D) or (V, K, D).
+            goal_fingerprint: hash of the goal's content.
+            device: where the embedder runs.
+            n_workers: processes that embed many states, default one per core.
+        """
+        self.config, self.starts, self.goals, self.goal_fingerprint = config, starts, goals, goal_fingerprint
+        embed_config = EmbedConfig(config.views, config.embedder, config.precision, device)
+        self.states = StateEmbedder(embed_config, n_workers=n_workers)
+
+    @classmethod
+    def build(cls, config: ScorerConfig, scene_qpos: NDArray[np.float64], **options: Any) -> Self:
+        """Read and embed the goal.
+
+        Args:
+            config: what is scored how.
+            scene_qpos: (nq,) a start state of the scene, for same-scene goals.
+            options: see the constructor.
+
+        Raises:
+            BadInput: the goal cannot be read, or the embedder does not read its kind.
+        """
+        task = get_task(config.views.task)
+        scene = None
+        if config.goal == SAME_SCENE:
+            with config.views.renderer() as renderer:
+                scene = scene_pair(renderer, scene_qpos, task)
+        goal = read_goal(config.goal, task, scene)
+        device = options.get("device", "auto")
+        embedder = EmbedConfig(config.views, config.embedder, config.precision, device).load_embedder()
+        if goal.is_text and not embedder.reads_text:
+            raise BadInput(
+                f"goal {goal.name!r} is a sentence, but embedder {config.embedder!r} reads pictures only; use one that "
+                "reads text, e.g. open_clip:ViT-B-32/openai, or a goal of pictures"
+            )
+        starts, goals = _embed_goal_cached(goal, embedder)
+        return cls(config, starts, goals, goal.fingerprint(), **options)
+
+    def score_episodes(
+        self, states: Sequence[NDArray[np.float64]], on_progress: Callable[[int, int], None] | None = None
+    ) -> tuple[list[FloatArray], int]:
+        """Score whole episodes.
+
+        Args:
+            states: (T+1, nq) simulator positions per episode.
+            on_progress: called with (parts embedded, parts in all).
+
+        Returns:
+            (T+1,) float32 scores per episode; and how many frames after the first had no change in any view.
+        """
+        embeddings, index = self.states.embed(np.concatenate(list(states)), on_progress)
+        scores, n_still, offset = [], 0, 0
+        for episode in states:
+            steps = index[offset : offset + len(episode)]
+            offset += len(episode)
+            distinct, inverse = np.unique(steps, return_inverse=True)  # resting objects repeat their state
+            frames = embeddings[np.concatenate([steps[:1], distinct])]  # x_0 first, as the scores want it
+            scores.append(self._score(frames)[1:][inverse])
+            still = np.all([zero_deltas(frames[:, view]) for view in range(frames.shape[1])], axis=0)
+            n_still += int(still[1:][inverse[1:]].sum())
+        return scores, n_still
+
+    def score_now(self, first: NDArray[np.float64], current: NDArray[np.float64]) -> FloatArray:
+        """Score one state of each of N running episodes.
+
+        Args:
+            first: (N, nq) their first states.
+            current: (N, nq) their current states.
+
+        Returns:
+            (N,) float32 scores.
+        """
+        pairs = np.stack([self.states.embed_now(first), self.states.embed_now(current)], axis=1)  # (N, 2, V, D)
+        return np.array([self._score(pair)[1] for pair in pairs], dtype=np.float32)
+
+    def _score(self, embeddings: FloatArray) -> FloatArray:
+        """(n, V, D) embeddings, the first of x_0 → (n,) scores."""
+        return score_views(embeddings, self.starts, self.goals, self.config.features, self.config.similarity)
+
+    def describe(self) -> dict[str, Any]:
+        """Config and content hashes, JSON-ready: what provenance records."""
+        return {
+            "config": asdict(self.config),
+            "goal_sha256": self.goal_fingerprint,
+            "embedder_sha256": self.states.embedder.fingerprint,
+            "views_sha256": self.config.views.fingerprint(),
+        }
+
+    def fingerprint(self) -> str:
+        """Hash of all that a score depends on; names of files and folders are left out."""
+        described = self.describe()
+        config = {k: v for k, v in described["config"].items() if k in ("features", "similarity")}
+        hashes = [described[k] for k in ("goal_sha256", "embedder_sha256", "views_sha256")]
+        return artifacts.hash_json([config, hashes])
+
+    def save(self, path: Path) -> None:
+        """Write the goal's embeddings and the config as one safetensors file."""
+        from safetensors.numpy import save
+
+        header = {"scorer": json.dumps(self.describe())}
+        arrays = {"starts": np.ascontiguousarray(self.starts), "goals": np.ascontiguousarray(self.goals)}
+        artifacts.write_bytes(path, save(arrays, metadata=header))
+
+    @classmethod
+    def load(cls, path: Path, **options: Any) -> Self:
+        """Read what `save` wrote.
+
+        Raises:
+            ZestError: the file is missing or damaged, or the embedder or renderer here is not the one that was used
+                (its scores would not be comparable).
+        """
+        from safetensors import SafetensorError, safe_open
+
+        try:
+            with safe_open(path, framework="numpy") as file:
+                described = json.loads(file.metadata()["scorer"])
+                starts, goals = file.get_tensor("starts"), file.get_tensor("goals")
+        except (OSError, SafetensorError, KeyError, TypeError) as error:
+            raise ZestError(f"the scorer {path} cannot be read ({error}); relabel the dataset again") from error
+        scorer = cls(ScorerConfig.from_dict(described["config"]), starts, goals, described["goal_sha256"], **options)
+        here = scorer.describe()
+        changed = [key for key in ("embedder_sha256", "views_sha256") if here[key] != described[key]]
+        if changed:
+            raise ZestError(
+                f"the scorer {path} was made with another {' and '.join(k.removesuffix('_sha256') for k in changed)} "
+                "(weights, precision, or versions differ); relabel and train here, or use the versions of its meta.json"
+            )
+        return scorer
+
+
+def _embed_goal_cached(goal: GoalSpec, embedder: Any) -> tuple[FloatArray, FloatArray]:
+    digest = artifacts.hash_json([goal.fingerprint(), embedder.fingerprint])
+    path = artifacts.cache_dir() / "goals" / f"{digest[:20]}.npz"
+    cached = read_arrays(path)
+    if cached is None:
+        starts, goals = embed_goal(goal, embedder)
+        write_arrays(path, {"starts": starts, "goals": goals})
+        return starts, goals
+    return cached["starts"], cached["goals"]

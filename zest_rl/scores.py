@@ -1,0 +1,175 @@
+"""ZeST scores: how much the robot's frames look like the goal. Pure functions on embeddings; no I/O, no config.
+
+Notation of Cui et al. 2022, §3: ψ(x) is the embedding of x, α the similarity, (G_0, G_f) the start and goal pictures,
+x_0 the first frame of the episode (alignment: `zest_rl.types`).
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.errors import BadInput, nearest
+from zest_rl.types import FloatArray
+
+Doubles = NDArray[np.float64]
+Features = Literal["raw", "delta"]
+Similarity = Literal["cos", "l2"]
+
+ZERO_DELTA = 1e-6
+"""A change shorter than this times ‖ψ(x_0)‖ has no direction: its cosine is defined as 0."""
+
+
+def _check(name: str, embeddings: FloatArray, dim: int | None = None) -> Doubles:
+    array = np.asarray(embeddings)
+    if array.ndim != 2 or len(array) == 0:
+        raise BadInput(f"{name} must have shape (N >= 1, D), got {array.shape}")
+    if dim is not None and array.shape[1] != dim:
+        raise BadInput(
+            f"{name} must have the frames' dimension D = {dim}, got {array.shape[1]}; "
+            "embed frames and goals with the same embedder"
+        )
+    if not np.isfinite(array).all():
+        raise BadInput(f"{name} must be finite, got NaN or infinity; look at the pictures and the embedder's precision")
+    return np.asarray(array, dtype=np.float64)
+
+
+def _cos(a: Doubles, b: Doubles, smallest: float = 0.0) -> Doubles:
+    """(N, D), (M, D) → (N, M) cosines; 0 where a row of either is not longer than `smallest`."""
+    length_a, length_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
+    products = a @ b.T
+    lengths = np.outer(length_a, length_b)
+    valid = np.outer(length_a > smallest, length_b > smallest)
+    return np.divide(products, lengths, out=np.zeros_like(products), where=valid)
+
+
+def _similarity(a: Doubles, b: Doubles, similarity: Similarity, smallest: float) -> Doubles:
+    """(N, D), (M, D) → (N, M)."""
+    if similarity == "cos":
+        return _cos(a, b, smallest)
+    if similarity == "l2":
+        return -np.stack([np.linalg.norm(a - row, axis=1) for row in b], axis=1)
+    raise BadInput(f"unknown similarity {similarity!r}; {nearest(similarity, ('cos', 'l2'))}")
+
+
+def _mean_over_goals(similarities: Doubles) -> FloatArray:
+    """(N, K) → (N,) float32."""
+    return np.asarray(similarities.mean(axis=1), dtype=np.float32)
+
+
+def score_raw(frame_embeddings: FloatArray, goal_embeddings: FloatArray, similarity: Similarity = "cos") -> FloatArray:
+    """φ_t = mean over goals of α(ψ(x_t), ψ(G_f)) (Eq. 1).
+
+    Args:
+        frame_embeddings: (T+1, D) embeddings of one episode's frames x_0 … x_T.
+        goal_embeddings: (K, D) embeddings of K goal pictures or sentences.
+        similarity: ``"cos"``, in [-1, 1]; or ``"l2"``, minus the Euclidean distance, at most 0.
+
+    Returns:
+        (T+1,) float32 scores.
+
+    Raises:
+        BadInput: shapes do not fit, or a value is not finite.
+    """
+    frames = _check("frame_embeddings", frame_embeddings)
+    goals = _check("goal_embeddings", goal_embeddings, frames.shape[1])
+    return _mean_over_goals(_similarity(frames, goals, similarity, 0.0))
+
+
+def _pairs(starts: Doubles, goals: Doubles) -> NDArray[np.intp]:
+    return np.asarray(_cos(goals, starts).argmax(axis=1))
+
+
+def pair_starts(start_embeddings: FloatArray, goal_embeddings: FloatArray) -> NDArray[np.intp]:
+    """For each goal the index of the start picture most similar to it, by cosine of raw embeddings (App. B).
+
+    Args:
+        start_embeddings: (S, D).
+        goal_embeddings: (K, D).
+
+    Returns:
+        (K,) integer indices into the starts.
+    """
+    goals = _check("goal_embeddings", goal_embeddings)
+    return _pairs(_check("start_embeddings", start_embeddings, goals.shape[1]), goals)
+
+
+def score_delta(
+    frame_embeddings: FloatArray,
+    start_embeddings: FloatArray,
+    goal_embeddings: FloatArray,
+    similarity: Similarity = "cos",
+) -> FloatArray:
+    """φ_t = mean over goals of α(ψ(x_t) − ψ(x_0), ψ(G_f) − ψ(G_0)) (Eq. 2), with G_0 from `pair_starts`.
+
+    A frame with ‖ψ(x_t) − ψ(x_0)‖ ≤ `ZERO_DELTA` · ‖ψ(x_0)‖ has cosine 0 (see `zero_deltas`).
+
+    Args:
+        frame_embeddings: (T+1, D) embeddings of one episode's frames x_0 … x_T.
+        start_embeddings: (S, D) embeddings of S start pictures or sentences.
+        goal_embeddings: (K, D) embeddings of K goal pictures or sentences.
+        similarity: ``"cos"``, in [-1, 1]; or ``"l2"``, minus the Euclidean distance, at most 0.
+
+    Returns:
+        (T+1,) float32 scores; the first is 0 for ``"cos"``.
+
+    Raises:
+        BadInput: shapes do not fit, or a value is not finite.
+    """
+    frames = _check("frame_embeddings", frame_embeddings)
+    starts = _check("start_embeddings", start_embeddings, frames.shape[1])
+    goals = _check("goal_embeddings", goal_embeddings, frames.shape[1])
+    changes = np.subtract(goals, starts[_pairs(starts, goals)])
+    smallest = ZERO_DELTA * float(np.linalg.norm(frames[0]))
+    return _mean_over_goals(_similarity(frames - frames[0], changes, similarity, smallest))
+
+
+def zero_deltas(frame_embeddings: FloatArray) -> NDArray[np.bool_]:
+    """Which frames of an episode have no direction of change against x_0: (T+1, D) → (T+1,) bool."""
+    frames = _check("frame_embeddings", frame_embeddings)
+    lengths = np.linalg.norm(frames - frames[0], axis=1)
+    return np.asarray(lengths <= ZERO_DELTA * np.linalg.norm(frames[0]))
+
+
+def score_views(
+    frame_embeddings: FloatArray,
+    start_embeddings: FloatArray,
+    goal_embeddings: FloatArray,
+    features: Features = "delta",
+    similarity: Similarity = "cos",
+) -> FloatArray:
+    """Score each view on its own and average over views (App. B, "Viewpoints").
+
+    Args:
+        frame_embeddings: (T+1, V, D) embeddings of V views of each frame.
+        start_embeddings: (S, D), the same for all views, or (V, S, D), each view its own.
+        goal_embeddings: (K, D) or (V, K, D).
+        features: ``"delta"`` (Eq. 2) or ``"raw"`` (Eq. 1, which does not use the starts).
+        similarity: as in `score_delta`.
+
+    Returns:
+        (T+1,) float32 scores.
+
+    Raises:
+        BadInput: shapes do not fit, a value is not finite, or a name is unknown.
+    """
+    frames = np.asarray(frame_embeddings)
+    if frames.ndim != 3 or frames.shape[1] == 0:
+        raise BadInput(f"frame_embeddings must have shape (T+1, V >= 1, D), got {frames.shape}")
+    n_views = frames.shape[1]
+    for name, goals in (("start_embeddings", start_embeddings), ("goal_embeddings", goal_embeddings)):
+        if goals.ndim == 3 and len(goals) != n_views:
+            raise BadInput(f"{name} must hold one set for each of the {n_views} views, got {len(goals)}")
+    total = np.zeros(len(frames), dtype=np.float64)
+    for view in range(n_views):
+        starts = start_embeddings[view] if start_embeddings.ndim == 3 else start_embeddings
+        goals = goal_embeddings[view] if goal_embeddings.ndim == 3 else goal_embeddings
+        if features == "delta":
+            total += score_delta(frames[:, view], starts, goals, similarity)
+        elif features == "raw":
+            total += score_raw(frames[:, view], goals, similarity)
+        else:
+            raise BadInput(f"unknown features {features!r}; {nearest(features, ('delta', 'raw'))}")
+    return np.asarray(total / n_views, dtype=np.float32)

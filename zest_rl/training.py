@@ -1,0 +1,381 @@
+"""Sample → loss → step → log → save / resume. Knows no algorithm and no environment.
+
+A run folder, and what each part of it is for::
+
+    run.json            what was asked for; a rerun that asks for something else is refused
+    metrics.csv, tb/    loss, gradient norm, learning rate, updates per second; tb/ is for TensorBoard
+    checkpoints/        the last two states of an unfinished run, each with a sha256 manifest
+    model.safetensors   the trained weights
+    meta.json           everything needed to load and to trace them; written last, so it says "finished"
+
+A run that was killed at any moment and is started again with the same arguments ends with the same bits as one that
+was not (on a CPU, with the same number of threads): weights, optimizer, both random generators and the running means
+are restored from the last checkpoint, and rows of the log after it are dropped.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.torch
+import torch
+from torch import Tensor, nn
+from torch.utils.tensorboard import SummaryWriter
+
+from zest_rl import artifacts
+from zest_rl.agents import get_agent
+from zest_rl.agents.base import DataFacts, Rules, autocast, check_fields, describe_data, resolve_precision
+from zest_rl.errors import BadInput, ZestError
+from zest_rl.types import Episode
+
+Progress = Callable[[int, dict[str, float]], None]
+COLUMNS = ("loss", "grad_norm", "learning_rate", "updates_per_s")
+RESULT_KEYS = ("n_params", "model_sha256", "train_seconds", "made_by")  # keys of meta.json that only the end knows
+N_CHECKPOINTS = 2
+
+
+def train(
+    agent: str,
+    config: Any,
+    episodes: Sequence[Episode],
+    run_dir: Path,
+    *,
+    n_updates: int,
+    seed: int,
+    meta: Mapping[str, Any],
+    device: str = "auto",
+    threads: int | None = None,
+    checkpoint_every: int = 500,
+    log_every: int = 50,
+    on_progress: Progress | None = None,
+) -> Path:
+    """Train a policy, or go on with a run that was cut short; return `run_dir`. A finished run returns at once.
+
+    Args:
+        agent: name in `zest_rl.agents.AGENTS`.
+        config: that agent's config.
+        episodes: the data; the rewards in them are all that is known about quality.
+        run_dir: folder of this run alone.
+        n_updates: gradient steps.
+        seed: of the weights, the batches and the dropout.
+        meta: facts about the data (JSON), copied into ``meta.json`` beside the run's own; part of the run's identity.
+        device: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``: CUDA where there is one.
+        threads: CPU threads; torch's current number by default. Bits depend on it, so it is recorded.
+        checkpoint_every: updates between checkpoints.
+        log_every: updates between rows of the log; a row holds means over the updates since the last one.
+        on_progress: called after every logged row with the number of updates done and the row.
+
+    Raises:
+        BadInput: an argument is out of range, the data do not suit, or `run_dir` holds another run.
+        ZestError: the loss is not finite, a checkpoint is damaged, or the folder cannot be written to.
+    """
+    definition = get_agent(agent)
+    if not isinstance(config, definition.config):
+        raise BadInput(f"agent {agent!r} takes a {definition.config.__name__}, got a {type(config).__name__}")
+    n_threads = torch.get_num_threads() if threads is None else threads
+    arguments = _Arguments(n_updates, seed, n_threads, checkpoint_every, log_every)
+    place = _find_device(device)
+    facts = describe_data(episodes)
+    sample = definition.sampler(config, facts, episodes)
+    precision = resolve_precision(config.amp, place)
+    request: dict[str, Any] = {
+        "agent": agent,
+        "config": asdict(config),
+        "n_updates": n_updates,
+        "seed": seed,
+        "device": str(place),
+        "threads": arguments.threads,
+        "precision": precision,
+        "data_sha256": artifacts.hash_arrays(*(a for e in episodes for a in (e.obs, e.actions, e.rewards))),
+    }
+    taken = sorted(meta.keys() & {*request, *asdict(facts), *RESULT_KEYS})
+    if taken:
+        raise BadInput(f"meta must not use the keys {', '.join(taken)}, which meta.json has already; rename them")
+    request |= meta
+
+    with artifacts.lock(run_dir):
+        _claim(run_dir, request)
+        if not (run_dir / "meta.json").exists():
+            with _torch_set_up(seed, arguments.threads, place):
+                state = _State.start(definition.build(config, facts).to(place), config.weight_decay, seed)
+                _resume(run_dir, state)
+
+                def draw_loss() -> Tensor:
+                    batch = {name: tensor.to(place) for name, tensor in sample(state.rng).items()}
+                    with autocast(precision, place):
+                        return definition.loss(state.model, batch)
+
+                _fit(run_dir, state, draw_loss, config, arguments, on_progress)
+            _finish(run_dir, state, request, facts)
+        shutil.rmtree(run_dir / "checkpoints", ignore_errors=True)
+    return run_dir
+
+
+@dataclass(frozen=True)
+class _Arguments:
+    n_updates: int
+    seed: int
+    threads: int
+    checkpoint_every: int
+    log_every: int
+
+    def __post_init__(self) -> None:
+        rules: Rules = {
+            "seed": (self.seed >= 0, "0 or positive"),
+            **{
+                name: (getattr(self, name) >= 1, "at least 1")
+                for name in ("n_updates", "threads", "checkpoint_every", "log_every")
+            },
+        }
+        check_fields("training", self, rules)
+
+
+@dataclass
+class _State:
+    """All that changes while training, and that a checkpoint therefore holds (with torch's random generators)."""
+
+    model: nn.Module
+    optimizer: torch.optim.Optimizer
+    rng: np.random.Generator
+    update: int = 0
+    recent: list[tuple[float, float]] = field(default_factory=list)  # (loss, gradient norm) since the last logged row
+    seconds: float = 0.0
+
+    @classmethod
+    def start(cls, model: nn.Module, weight_decay: float, seed: int) -> _State:
+        trained = [p for p in model.parameters() if p.requires_grad]
+        optimizer = torch.optim.AdamW(trained, weight_decay=weight_decay, fused=True)
+        return cls(model.train(), optimizer, np.random.default_rng(seed))
+
+    @property
+    def params(self) -> dict[str, nn.Parameter]:
+        """Trained parameters by name, in the optimizer's order."""
+        return {name: p for name, p in self.model.named_parameters() if p.requires_grad}
+
+
+# ------------------------------------------------------------------------------------------------------------ loop
+
+
+def _fit(
+    run_dir: Path,
+    state: _State,
+    draw_loss: Callable[[], Tensor],
+    config: Any,
+    arguments: _Arguments,
+    on_progress: Progress | None,
+) -> None:
+    params = list(state.params.values())
+    with _open_log(run_dir, state.update) as write_row:
+        tick = row_tick = time.perf_counter()
+        while state.update < arguments.n_updates:
+            warm = min(1.0, (state.update + 1) / config.warmup_updates) if config.warmup_updates else 1.0
+            for group in state.optimizer.param_groups:
+                group["lr"] = config.learning_rate * warm
+            loss = draw_loss()
+            state.optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            norm = nn.utils.clip_grad_norm_(params, config.grad_clip)
+            state.optimizer.step()
+            state.update += 1
+            state.recent.append((loss.item(), norm.item()))
+            if not all(map(math.isfinite, state.recent[-1])):
+                raise ZestError(
+                    f"loss and gradient must be finite, got {state.recent[-1]} at update {state.update}; "
+                    "lower learning_rate or set amp to fp32, and train into a new folder"
+                )
+            now = time.perf_counter()
+            state.seconds, tick = state.seconds + now - tick, now
+            if state.update % arguments.log_every == 0 or state.update == arguments.n_updates:
+                losses, norms = np.mean(state.recent, axis=0)
+                speed = len(state.recent) / (now - row_tick)
+                values = (float(losses), float(norms), config.learning_rate * warm, round(speed, 2))
+                row = dict(zip(COLUMNS, values, strict=True))
+                write_row(state.update, row)
+                state.recent, row_tick = [], now
+                if on_progress is not None:
+                    on_progress(state.update, row)
+            if state.update % arguments.checkpoint_every == 0 and state.update < arguments.n_updates:
+                _save_checkpoint(run_dir, state)
+
+
+@contextmanager
+def _torch_set_up(seed: int, threads: int, device: torch.device) -> Iterator[None]:
+    """Seed torch and set its threads; put both back at the end."""
+    before = torch.get_num_threads()
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        try:
+            torch.set_num_threads(threads)
+            torch.manual_seed(seed)
+            yield
+        finally:
+            torch.set_num_threads(before)
+
+
+def _find_device(name: str) -> torch.device:
+    kind, _, index = name.partition(":")
+    if kind not in ("auto", "cpu", "cuda") or (index and not (kind == "cuda" and index.isdecimal())):
+        raise BadInput(f"device must be auto, cpu, cuda or cuda:N, got {name!r}")
+    n_cuda = torch.cuda.device_count()
+    if kind == "cpu" or (kind == "auto" and n_cuda == 0):
+        return torch.device("cpu")
+    if int(index or 0) >= n_cuda:
+        raise BadInput(f"device {name!r} is not there: {n_cuda} CUDA devices found; use cpu or auto")
+    return torch.device("cuda", int(index or 0))
+
+
+# ------------------------------------------------------------------------------------------------------------- log
+
+
+@contextmanager
+def _open_log(run_dir: Path, n_done: int) -> Iterator[Callable[[int, Mapping[str, float]], None]]:
+    """Open ``metrics.csv`` and ``tb/`` after dropping what a killed run logged past update `n_done`."""
+    path, header = run_dir / "metrics.csv", ",".join(("update", *COLUMNS))
+    lines = path.read_text().splitlines() if path.exists() and n_done else []
+    kept = [line for line in lines[1:] if line.count(",") == len(COLUMNS) and int(line.partition(",")[0]) <= n_done]
+    artifacts.write_bytes(path, "".join(f"{line}\n" for line in (header, *kept)).encode())
+    if not n_done:
+        shutil.rmtree(run_dir / "tb", ignore_errors=True)
+    board = SummaryWriter(run_dir / "tb", purge_step=n_done + 1)
+    with path.open("a", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+
+        def write_row(update: int, values: Mapping[str, float]) -> None:
+            writer.writerow([update, *values.values()])
+            file.flush()
+            os.fsync(file.fileno())  # a checkpoint after this row must find it
+            for name, value in values.items():
+                board.add_scalar(name, value, update)
+
+        try:
+            yield write_row
+        finally:
+            board.close()
+
+
+# ----------------------------------------------------------------------------------------------------- checkpoints
+
+
+def _save_checkpoint(run_dir: Path, state: _State) -> None:
+    """Write the state under ``checkpoints/update-N`` and remove all but the newest `N_CHECKPOINTS`."""
+    folder = run_dir / "checkpoints" / f"update-{state.update:09d}"
+    moments = {
+        f"{name}/{key}": tensor
+        for name, parameter in state.params.items()
+        for key, tensor in state.optimizer.state[parameter].items()
+    }
+    generators = {"cpu": torch.get_rng_state()}
+    cuda = next(state.model.parameters()).device
+    if cuda.type == "cuda":
+        generators["cuda"] = torch.cuda.get_rng_state(cuda)
+    weights = state.model.state_dict()
+    artifacts.check_free_space(run_dir, sum(t.nbytes for t in (*weights.values(), *moments.values())))
+    with artifacts.staged_folder(folder) as staging:
+        for name, tensors in (("model", weights), ("optimizer", moments), ("generators", generators)):
+            safetensors.torch.save_file(tensors, staging / f"{name}.safetensors")
+        progress = {
+            "update": state.update,
+            "seconds": state.seconds,
+            "recent": state.recent,
+            "sampler": state.rng.bit_generator.state,
+        }
+        artifacts.write_json(staging / "state.json", progress)
+        manifest = {path.name: artifacts.hash_file(path) for path in sorted(staging.iterdir())}
+        artifacts.write_json(staging / "manifest.json", manifest)
+    for old in _checkpoints(run_dir)[:-N_CHECKPOINTS]:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _checkpoints(run_dir: Path) -> list[Path]:
+    return sorted((run_dir / "checkpoints").glob("update-*"))
+
+
+def _resume(run_dir: Path, state: _State) -> None:
+    """Bring `state` and torch's generators to the newest checkpoint, if there is one."""
+    folders = _checkpoints(run_dir)
+    if not folders:
+        return
+    folder = folders[-1]
+    _verify(folder)
+    tensors = {
+        name: safetensors.torch.load_file(folder / f"{name}.safetensors")
+        for name in ("model", "optimizer", "generators")
+    }
+    state.model.load_state_dict(tensors["model"])
+    moments: dict[int, dict[str, Tensor]] = {i: {} for i in range(len(state.params))}
+    places = {name: i for i, name in enumerate(state.params)}
+    for full_name, tensor in tensors["optimizer"].items():
+        name, _, key = full_name.rpartition("/")
+        moments[places[name]][key] = tensor.clone()
+    state.optimizer.load_state_dict({"state": moments, "param_groups": state.optimizer.state_dict()["param_groups"]})
+    torch.set_rng_state(tensors["generators"]["cpu"])
+    if "cuda" in tensors["generators"]:
+        torch.cuda.set_rng_state(tensors["generators"]["cuda"], next(state.model.parameters()).device)
+    progress = artifacts.read_json(folder / "state.json")
+    state.update, state.seconds = progress["update"], progress["seconds"]
+    state.recent = [(loss, norm) for loss, norm in progress["recent"]]
+    state.rng.bit_generator.state = progress["sampler"]
+
+
+def _verify(folder: Path) -> None:
+    try:
+        manifest: dict[str, str] = artifacts.read_json(folder / "manifest.json")
+        bad = [name for name, sha256 in manifest.items() if artifacts.hash_file(folder / name) != sha256]
+    except (ZestError, OSError, AttributeError):
+        bad = ["manifest.json"]
+    if bad:
+        raise ZestError(
+            f"checkpoint {folder} is damaged: {', '.join(bad)} is not what was written; delete this folder and start "
+            "the run again, which then goes on from the checkpoint before it"
+        )
+
+
+# --------------------------------------------------------------------------------------------------- start and end
+
+
+def _claim(run_dir: Path, request: dict[str, Any]) -> None:
+    """Write ``run.json``, or check that the one that is there asks for the same."""
+    path = run_dir / "run.json"
+    if path.exists():
+        before, now = _flat(artifacts.read_json(path)), _flat(json.loads(json.dumps(request)))
+        differing = [
+            f"{key} (was {before.get(key)!r}, is {now.get(key)!r})"
+            for key in sorted(before.keys() | now.keys())
+            if before.get(key) != now.get(key)
+        ]
+        if differing:
+            raise BadInput(
+                f"{run_dir} holds a run with other arguments: {'; '.join(differing)}; repeat the arguments of that "
+                "run, or choose another folder"
+            )
+    elif run_dir.exists() and any(not entry.name.startswith(".") for entry in run_dir.iterdir()):
+        raise BadInput(f"{run_dir} is not empty and holds no run; choose another folder")
+    else:
+        artifacts.write_json(path, request)
+
+
+def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested objects as one, with dotted keys."""
+    items: dict[str, Any] = {}
+    for key, entry in value.items():
+        items |= _flat(entry, f"{prefix}{key}.") if isinstance(entry, dict) else {f"{prefix}{key}": entry}
+    return items
+
+
+def _finish(run_dir: Path, state: _State, request: dict[str, Any], facts: DataFacts) -> None:
+    """Write the weights, then ``meta.json``."""
+    weights = safetensors.torch.save({name: tensor.cpu() for name, tensor in state.model.state_dict().items()})
+    artifacts.write_bytes(run_dir / "model.safetensors", weights)
+    n_params = sum(p.numel() for p in state.params.values())
+    results = (n_params, artifacts.hash_bytes(weights), round(state.seconds, 1), artifacts.provenance())
+    artifacts.write_json(run_dir / "meta.json", request | asdict(facts) | dict(zip(RESULT_KEYS, results, strict=True)))

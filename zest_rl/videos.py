@@ -1,0 +1,44 @@
+"""Recorded states → MP4 videos with the robot in view, for people to look at; no score is computed from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl import artifacts
+from zest_rl.rendering import Camera, RenderConfig, StateRenderer
+from zest_rl.tasks import Task
+
+FPS = 12.5
+"""Frames per second of the environment: a video runs in real time."""
+
+
+def write_video(states: NDArray[np.float64], task: Task, path: Path, *, size: int = 320) -> Path:
+    """Render an episode and write it as H.264.
+
+    Args:
+        states: (T+1, nq) simulator positions.
+        task: what the camera looks at.
+        path: where the MP4 is left, atomically.
+        size: side of the square frames, in pixels; even.
+    """
+    camera = Camera(lookat=task.lookat, distance=2.2, azimuth=70.0, elevation=-25.0)
+    with StateRenderer(RenderConfig(size=size, robot=True), (camera,)) as renderer:
+        frames = [renderer.render(qpos)[0] for qpos in states]
+    with artifacts.atomic_path(path) as temporary:
+        mp4 = temporary.with_suffix(".mp4")
+        try:
+            imageio.mimwrite(mp4, frames, fps=FPS, codec="libx264", quality=7, macro_block_size=2)
+            mp4.replace(temporary)
+        finally:
+            mp4.unlink(missing_ok=True)
+    return path
+
+
+def representative(returns: NDArray[np.float64]) -> dict[str, int]:
+    """Indices of the best, the median and the worst episode by return; ties go to the earlier one."""
+    order = np.argsort(-np.asarray(returns), kind="stable")
+    return {"best": int(order[0]), "median": int(order[len(order) // 2]), "worst": int(order[-1])}
