@@ -140,7 +140,11 @@ class References:
 
 
 def measure_references(
-    behaviour: Behaviour, n_episodes: int = 100, *, on_progress: Callable[[int], None] | None = None
+    behaviour: Behaviour,
+    n_episodes: int = 100,
+    *,
+    n_workers: int | None = None,
+    on_progress: Callable[[int], None] | None = None,
 ) -> References:
     """Measure expert and do-nothing returns on starts that no dataset uses.
 
@@ -152,6 +156,7 @@ def measure_references(
             replace(behaviour, policy=policy, noise_max=0.0),
             n_episodes,
             first=REFERENCE_STREAM,
+            n_workers=n_workers,
             on_progress=on_progress,
         )
         for policy in ("expert", "nothing")
@@ -175,6 +180,7 @@ def calibrate(
     *,
     tolerance: float = 0.5,
     n_rounds: int = 10,
+    n_workers: int | None = None,
     on_round: Callable[[float, float], None] | None = None,
 ) -> float:
     """Find the `noise_max` at which the episodes' mean normalized return meets `target`, by bisection.
@@ -186,6 +192,7 @@ def calibrate(
         target: percent of the expert, e.g. 81.19.
         tolerance: stop within this many percent.
         n_rounds: at most so many tries.
+        n_workers: processes, default one per core.
         on_round: called with (noise_max, percent) after each.
 
     Raises:
@@ -194,7 +201,7 @@ def calibrate(
     low, high = 0.0, LARGEST_NOISE
     for _ in range(n_rounds):
         noise_max = round((low + high) / 2, 4)
-        episodes = run_behaviour(replace(behaviour, noise_max=noise_max), n_episodes)
+        episodes = run_behaviour(replace(behaviour, noise_max=noise_max), n_episodes, n_workers=n_workers)
         level = 100 * (returns(episodes).mean() - references.minimum) / (references.expert - references.minimum)
         if on_round is not None:
             on_round(noise_max, level)

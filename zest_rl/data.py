@@ -209,3 +209,39 @@ def fingerprint(dataset_id: str) -> str:
         for episode, states in zip(read_episodes(dataset_id), read_states(dataset_id), strict=True)
     ]
     return artifacts.hash_json(digests)
+
+
+def describe(dataset_id: str) -> dict[str, Any]:
+    """What a trained policy must remember of its dataset, JSON-ready: identity, environment, scale, how it was made."""
+    metadata = read_metadata(dataset_id)
+    for key in ("env_spec", "ref_min_score", "ref_max_score"):
+        if metadata.get(key) is None:
+            raise BadInput(
+                f"dataset {dataset_id} has no {key} in its metadata, so a policy could not be evaluated on it; "
+                "give env, eval_env and both reference scores when the dataset is made"
+            )
+    return {
+        "id": dataset_id,
+        "sha256": fingerprint(dataset_id),
+        "rewards_sha256": artifacts.hash_arrays(*(episode.rewards for episode in read_episodes(dataset_id))),
+        "env_spec": metadata["env_spec"],
+        "ref_min_score": metadata["ref_min_score"],
+        "ref_max_score": metadata["ref_max_score"],
+        "zest": metadata.get("zest", {}),
+    }
+
+
+def task_name(dataset_id: str) -> str:
+    """Return which kitchen task a dataset is of.
+
+    Raises:
+        BadInput: its environment is not the kitchen.
+    """
+    spec = json.loads(read_metadata(dataset_id).get("env_spec") or "{}")
+    name = spec.get("kwargs", {}).get("task")
+    if name is None or not str(spec.get("entry_point")).startswith("zest_rl."):
+        raise BadInput(
+            f"dataset {dataset_id} is of environment {spec.get('id')!r}; frames can be rendered for zest/Kitchen-v0 "
+            "only, so collect a dataset with `zest collect`"
+        )
+    return str(name)

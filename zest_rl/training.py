@@ -178,6 +178,7 @@ def _fit(
     params = list(state.params.values())
     with _open_log(run_dir, state.update) as write_row:
         tick = row_tick = time.perf_counter()
+        row_update = state.update
         while state.update < arguments.n_updates:
             warm = min(1.0, (state.update + 1) / config.warmup_updates) if config.warmup_updates else 1.0
             for group in state.optimizer.param_groups:
@@ -198,11 +199,11 @@ def _fit(
             state.seconds, tick = state.seconds + now - tick, now
             if state.update % arguments.log_every == 0 or state.update == arguments.n_updates:
                 losses, norms = np.mean(state.recent, axis=0)
-                speed = len(state.recent) / (now - row_tick)
+                speed = (state.update - row_update) / (now - row_tick)
                 values = (float(losses), float(norms), config.learning_rate * warm, round(speed, 2))
                 row = dict(zip(COLUMNS, values, strict=True))
                 write_row(state.update, row)
-                state.recent, row_tick = [], now
+                state.recent, row_update, row_tick = [], state.update, now
                 if on_progress is not None:
                     on_progress(state.update, row)
             if state.update % arguments.checkpoint_every == 0 and state.update < arguments.n_updates:

@@ -98,12 +98,15 @@ class CheapDropout(nn.Dropout):
     """
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return `x` with a share p zeroed and the rest divided by 1 − p, as `nn.Dropout` does; any shape."""
+        """Return `x`, any shape, with a share p zeroed and the rest divided by 1 − p, as `nn.Dropout` does.
+
+        While training the result is float32, the type of the residual stream that it is added to.
+        """
         if not self.training or self.p == 0:
             return x
         bits = torch.empty((x.numel() + 3) // 4, dtype=torch.int64, device=x.device).random_(-(2**63), None)
         keep = bits.view(torch.int16)[: x.numel()].view(x.shape) >= round(self.p * 2**16) - 2**15
-        return x * keep / (1 - self.p)
+        return x * (keep / (1 - self.p))
 
 
 def build_model(config: DTConfig, facts: DataFacts) -> nn.Module:

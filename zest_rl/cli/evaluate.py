@@ -1,0 +1,74 @@
+"""``zest evaluate``: a policy → returns and success in MuJoCo, with videos of its best, median and worst episode."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from zest_rl.cli.ui import Ui
+
+
+@dataclass(frozen=True)
+class Config:
+    """Evaluate a trained policy: normalized ground-truth return and success, with 95 % intervals."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Folder that `zest train` left."""
+    n_episodes: int = 50
+    """Episodes; equal seeds give equal starts to every policy."""
+    seed: int = 1_000_000
+    """First seed of the starts."""
+    rtg: Literal["online", "constant", "schedule"] = "online"
+    """How the return-to-go falls: by the online score, not at all, or as in the best training episode."""
+    target_quantile: float = 1.0
+    """The return that is asked for, as a quantile of the training returns."""
+    score: bool = False
+    """Record ZeST scores also where the policy does not need them (only for runs on relabeled datasets)."""
+    videos: bool = True
+    """Write videos of the best, median and worst episode."""
+    device: str = "cpu"
+    """Where the policy runs."""
+    n_workers: int | None = None
+    """Processes; default one per core."""
+
+
+def run(config: Config, ui: Ui) -> dict[str, Any]:
+    """Roll out, summarise, write videos."""
+    import json
+    import time
+
+    from zest_rl.evaluation import EvaluationConfig, evaluate, evaluation_folder
+    from zest_rl.tasks import get_task
+    from zest_rl.videos import representative, write_video
+
+    started = time.monotonic()
+    settings = EvaluationConfig(config.n_episodes, config.seed, config.rtg, config.target_quantile)
+    with ui.progress("episodes", config.n_episodes) as advance:
+        result = evaluate(
+            config.run,
+            settings,
+            score=config.score,
+            device=config.device,
+            n_workers=config.n_workers,
+            on_progress=advance,
+        )
+    folder = evaluation_folder(config.run, settings)
+    seconds = time.monotonic() - started
+    videos = {}
+    if config.videos:
+        meta = json.loads((config.run / "meta.json").read_text())
+        task = get_task(json.loads(meta["dataset"]["env_spec"])["kwargs"]["task"])
+        for name, index in representative(result.normalized()).items():
+            path = folder / f"{name}.mp4"
+            videos[name] = str(path if path.exists() else write_video(result.traces["qpos"][index], task, path))
+    return {
+        "run": str(config.run),
+        **result.summary(),
+        "result": str(folder / "result.json"),
+        "videos": videos,
+        "seconds": round(seconds, 2),
+        "next": f"zest report {config.run}",
+    }
