@@ -256,10 +256,33 @@ def evaluate(
             "references": {"minimum": result.minimum, "expert": result.expert},
             "summary": result.summary(),
             "episodes": [asdict(episode) for episode in result.episodes],
+            "parts": [f"{name}.npz" for name in jobs],
             "provenance": artifacts.provenance(),
         },
     )
     return result
+
+
+def read_evaluation(folder: Path) -> Evaluation:
+    """Read what `evaluate` left in ``RUN/evaluations/NAME``.
+
+    Raises:
+        ZestError: there is no result, or a part is damaged; evaluate again.
+    """
+    result = artifacts.read_json(folder / "result.json")
+    config = EvaluationConfig(**result["config"])
+    parts = [read_arrays(folder / "parts" / name) for name in result["parts"]]
+    if any(part is None for part in parts):
+        raise ZestError(f"parts of the evaluation {folder} are missing or damaged; evaluate the run again")
+    return Evaluation(
+        folder.parent.parent,
+        config,
+        result["summary"]["target_return"],
+        result["references"]["minimum"],
+        result["references"]["expert"],
+        tuple(EpisodeResult(**episode) for episode in result["episodes"]),
+        concatenate([part for part in parts if part is not None]),
+    )
 
 
 def evaluation_folder(run: Path, config: EvaluationConfig) -> Path:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from PIL import Image
 
 from zest_rl import artifacts, data
 from zest_rl.data_writer import write_relabeled
@@ -18,6 +19,9 @@ from zest_rl.types import FloatArray
 
 Reward = Literal["level", "difference"]
 SCORER_FILE = "zest_scorer.safetensors"
+GOAL_FOLDER = "zest_goal"
+MAX_THUMBNAILS, THUMBNAIL = 8, 160
+"""Pictures per side of a goal that a report shows, and their largest side in pixels."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +108,20 @@ def relabel(
                 "provenance": artifacts.provenance(),
             }
         },
-        extra=lambda folder: scorer.save(folder / SCORER_FILE),
+        extra=lambda folder: _leave_scorer(folder, scorer),
     )
     return Relabeled(target_id, path, scorer, n_frames, n_still, already_there=False)
+
+
+def _leave_scorer(folder: Path, scorer: Scorer) -> None:
+    """Leave the scorer, for online scores, and small pictures of the goal, for reports, in a dataset's folder."""
+    scorer.save(folder / SCORER_FILE)
+    goal = scorer.goal
+    if goal is None or goal.is_text:
+        return
+    for part, pictures in (("init", goal.starts), ("goal", goal.goals)):
+        (folder / GOAL_FOLDER / part).mkdir(parents=True)
+        for i, picture in enumerate(pictures[:MAX_THUMBNAILS]):
+            thumbnail = Image.fromarray(np.asarray(picture))
+            thumbnail.thumbnail((THUMBNAIL, THUMBNAIL))
+            thumbnail.save(folder / GOAL_FOLDER / part / f"{i}.png")

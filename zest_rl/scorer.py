@@ -70,6 +70,8 @@ class Scorer:
         """
         self.config, self.starts, self.goals, self.goal_fingerprint = config, starts, goals, goal_fingerprint
         embed_config = EmbedConfig(config.views, config.embedder, config.precision, device)
+        self.goal: GoalSpec | None = None
+        """The goal itself; None when only its embeddings were loaded."""
         self.states = StateEmbedder(embed_config, n_workers=n_workers)
 
     @classmethod
@@ -98,7 +100,9 @@ class Scorer:
                 "reads text, e.g. open_clip:ViT-B-32/openai, or a goal of pictures"
             )
         starts, goals = _embed_goal_cached(goal, embedder)
-        return cls(config, starts, goals, goal.fingerprint(), **options)
+        scorer = cls(config, starts, goals, goal.fingerprint(), **options)
+        scorer.goal = goal
+        return scorer
 
     def score_episodes(
         self, states: Sequence[NDArray[np.float64]], on_progress: Callable[[int, int], None] | None = None

@@ -92,7 +92,9 @@ def load_embedder(
     Args:
         uri: the embedder.
         device: "auto" (CUDA where there is one, else the CPU), "cpu", "cuda", "cuda:1", "mps".
-        precision: of weights and activations; "auto" is bf16 where the hardware computes it natively, else fp32.
+        precision: of weights and activations; "auto" is bf16 where the hardware computes it natively, else fp32. The
+            embedded default stays fp32: its small deltas suffer from bf16 (cosine to fp32 .89 to .99 on renderings,
+            against ≥ .9999 for ViT-B/32 and ResNet50).
         batch_size: frames or sentences per forward pass.
 
     Raises:
@@ -104,7 +106,7 @@ def load_embedder(
     if batch_size < 1:
         raise BadInput(f"batch_size must be at least 1, got {batch_size}")
     _check_device(device)
-    bf16 = precision == "bf16" or (precision == "auto" and _computes_bf16(device))
+    bf16 = precision == "bf16" or (precision == "auto" and _computes_bf16(device) and uri != DEFAULT_EMBEDDER)
 
     if uri == DEFAULT_EMBEDDER:
         weights = installed_weights()
