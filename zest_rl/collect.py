@@ -27,6 +27,8 @@ EPISODES_PER_JOB = 5
 REFERENCE_STREAM = 2**31
 """Episodes from this index on serve the reference returns; datasets stay below it."""
 LARGEST_NOISE = 2.0
+N_NOTHING = 10
+"""Episodes of the robot doing nothing: their returns hardly differ."""
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -154,12 +156,12 @@ def measure_references(
     runs = {
         policy: run_behaviour(
             replace(behaviour, policy=policy, noise_max=0.0),
-            n_episodes,
+            n,
             first=REFERENCE_STREAM,
             n_workers=n_workers,
             on_progress=on_progress,
         )
-        for policy in ("expert", "nothing")
+        for policy, n in (("expert", n_episodes), ("nothing", N_NOTHING))
     }
     minimum, expert = (float(returns(runs[policy]).mean()) for policy in ("nothing", "expert"))
     if not expert > minimum:

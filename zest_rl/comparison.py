@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from zest_rl import artifacts, data, metrics
 from zest_rl.errors import BadInput
-from zest_rl.evaluation import Evaluation, read_evaluation
+from zest_rl.evaluation import Evaluation, evaluation_folder, read_evaluation
 from zest_rl.images import list_images, read_image
 from zest_rl.relabel import GOAL_FOLDER, SCORER_FILE
 from zest_rl.report import Curve, EpisodePanel, GoalPanel, MethodRow, Report, Scatter
@@ -100,7 +100,7 @@ def goal_scatter(name: str, dataset_id: str) -> Scatter:
     """ZeST return against ground-truth return of a relabeled dataset's episodes."""
     zest = np.array([score[1:].sum() for score in data.read_scores(dataset_id)], dtype=np.float32)
     truth = np.array([e.episode_return for e in data.read_ground_truth(dataset_id)], dtype=np.float32)
-    rho = metrics.spearman(zest, truth)
+    rho = metrics.spearman(zest.astype(np.float64), truth.astype(np.float64))
     return Scatter(name, zest, truth, rho.value, (rho.low, rho.high))
 
 
@@ -118,7 +118,7 @@ def goal_panel(name: str, dataset_id: str, scatter: Scatter) -> GoalPanel:
 def episode_panels(name: str, evaluation: Evaluation, task: Task, scorer: Scorer | None) -> list[EpisodePanel]:
     """Best, median and worst episode of an evaluation: video, score over time, ground-truth progress."""
     panels = []
-    folder = evaluation.run / "evaluations" / artifacts.hash_json(evaluation.config.__dict__)[:8]
+    folder = evaluation_folder(evaluation.run, evaluation.config)
     values = evaluation.normalized()
     for which, index in representative(values).items():
         states: NDArray[np.float64] = evaluation.traces["qpos"][index]

@@ -212,7 +212,10 @@ def fingerprint(dataset_id: str) -> str:
 
 
 def describe(dataset_id: str) -> dict[str, Any]:
-    """What a trained policy must remember of its dataset, JSON-ready: identity, environment, scale, how it was made."""
+    """What a trained policy must remember of its dataset, JSON-ready: identity, environment, scale, how it was made.
+
+    Command, versions and machine stay in the dataset's metadata: an equal dataset made again has an equal description.
+    """
     metadata = read_metadata(dataset_id)
     for key in ("env_spec", "ref_min_score", "ref_max_score"):
         if metadata.get(key) is None:
@@ -227,7 +230,10 @@ def describe(dataset_id: str) -> dict[str, Any]:
         "env_spec": metadata["env_spec"],
         "ref_min_score": metadata["ref_min_score"],
         "ref_max_score": metadata["ref_max_score"],
-        "zest": metadata.get("zest", {}),
+        "zest": {
+            stage: {key: value for key, value in facts.items() if key != "provenance"}
+            for stage, facts in metadata.get("zest", {}).items()
+        },
     }
 
 

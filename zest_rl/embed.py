@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
+from multiprocessing.util import Finalize
 from pathlib import Path
 
 import numpy as np
@@ -42,9 +43,11 @@ class EmbedConfig:
         return load_embedder(self.embedder, device=self.device, precision=self.precision)
 
 
-@functools.lru_cache(maxsize=2)
+@functools.lru_cache(maxsize=None)
 def _renderer(views: Views) -> StateRenderer:
-    return views.renderer()
+    renderer = views.renderer()
+    Finalize(None, renderer.close, exitpriority=0)  # in worker processes, too; left open, GL complains at exit
+    return renderer
 
 
 @functools.lru_cache(maxsize=2)

@@ -5,11 +5,14 @@ A spec is one string:
 - ``same-scene``: the scene itself, rendered before and after; each camera view gets its own pair;
 - ``drawings``: the small drawings that come with the package;
 - a folder with ``init/`` and ``goal/``, each holding one or more pictures;
+- ``visual-tasks:real_imgs`` or ``visual-tasks:drawings``: the task's folder in the paper's Visual Tasks Dataset, which
+  the environment variable ZEST_VISUAL_TASKS points to;
 - ``text:closed microwave -> open microwave`` (several sentences are separated by ``|``).
 """
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +26,8 @@ from zest_rl.images import list_images, read_image
 from zest_rl.tasks import Task
 from zest_rl.types import Frame
 
-SAME_SCENE, DRAWINGS, TEXT = "same-scene", "drawings", "text:"
+SAME_SCENE, DRAWINGS, VISUAL_TASKS, TEXT = "same-scene", "drawings", "visual-tasks:", "text:"
+VISUAL_TASKS_VARIABLE = "ZEST_VISUAL_TASKS"
 
 
 @dataclass(frozen=True)
@@ -108,6 +112,21 @@ def drawings(task: Task) -> GoalSpec:
     return read_folder(folder, DRAWINGS)
 
 
+def visual_tasks(spec: str, task: Task) -> GoalSpec:
+    """Read a task's folder of the Visual Tasks Dataset.
+
+    Raises:
+        BadInput: the environment variable does not point to the dataset, or it has no such folder.
+    """
+    root = os.environ.get(VISUAL_TASKS_VARIABLE)
+    if not root:
+        raise BadInput(
+            f"goal {spec!r} needs the environment variable {VISUAL_TASKS_VARIABLE}: set it to your copy of the Visual "
+            "Tasks Dataset (the folder that holds real_imgs/ and drawings/)"
+        )
+    return read_folder(Path(root) / spec.removeprefix(VISUAL_TASKS) / task.goal_folder, spec)
+
+
 def read_goal(spec: str, task: Task, scene: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None = None) -> GoalSpec:
     """Read a goal spec of any kind.
 
@@ -127,11 +146,13 @@ def read_goal(spec: str, task: Task, scene: tuple[NDArray[np.uint8], NDArray[np.
         return drawings(task)
     if spec.startswith(TEXT):
         return read_text(spec)
+    if spec.startswith(VISUAL_TASKS):
+        return visual_tasks(spec, task)
     folder = Path(spec).expanduser()
     if not folder.exists():
         raise BadInput(
-            f"unknown goal {spec!r}: it is neither {SAME_SCENE!r}, {DRAWINGS!r}, 'text:START -> GOAL', nor an existing "
-            "folder with init/ and goal/"
+            f"unknown goal {spec!r}: it is neither {SAME_SCENE!r}, {DRAWINGS!r}, '{VISUAL_TASKS}real_imgs', "
+            "'text:START -> GOAL', nor an existing folder with init/ and goal/"
         )
     return read_folder(folder, spec)
 

@@ -56,7 +56,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
     behaviour = collect.Behaviour(config.task, "expert", seed=config.seed, noise_max=config.noise_max or 0.0)
     n_reference = 100
-    with ui.progress("reference returns (expert, doing nothing)", 2 * n_reference) as advance:
+    with ui.progress("reference returns (expert, doing nothing)", n_reference + collect.N_NOTHING) as advance:
         references = collect.measure_references(behaviour, n_reference, n_workers=config.n_workers, on_progress=advance)
     ui.say(f"expert: return {references.expert:.2f}, success {references.expert_success:.0%}")
     noise_max = config.noise_max

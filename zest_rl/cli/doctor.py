@@ -165,7 +165,7 @@ def check_processor() -> Iterator[Check]:
 
 def check_ffmpeg() -> Iterator[Check]:
     """Look for the ffmpeg that writes and reads videos."""
-    import imageio_ffmpeg  # type: ignore[import-untyped]
+    import imageio_ffmpeg
 
     yield Check("ffmpeg", "ok", imageio_ffmpeg.get_ffmpeg_version())
 
