@@ -43,7 +43,7 @@ class EmbedConfig:
         return load_embedder(self.embedder, device=self.device, precision=self.precision)
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _renderer(views: Views) -> StateRenderer:
     renderer = views.renderer()
     Finalize(None, renderer.close, exitpriority=0)  # in worker processes, too; left open, GL complains at exit
