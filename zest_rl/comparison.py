@@ -20,7 +20,6 @@ from zest_rl.relabel import GOAL_FOLDER, SCORER_FILE
 from zest_rl.report import Curve, EpisodePanel, GoalPanel, MethodRow, Report, Scatter
 from zest_rl.report.data import Kind
 from zest_rl.scorer import Scorer
-from zest_rl.tasks import Task, get_task
 from zest_rl.videos import FPS, representative, write_video
 
 
@@ -115,7 +114,7 @@ def goal_panel(name: str, dataset_id: str, scatter: Scatter) -> GoalPanel:
     return GoalPanel(name, (sides[0],), (sides[-1],), scatter.spearman, len(scatter.gt_returns))
 
 
-def episode_panels(name: str, evaluation: Evaluation, task: Task, scorer: Scorer | None) -> list[EpisodePanel]:
+def episode_panels(name: str, evaluation: Evaluation, scorer: Scorer | None) -> list[EpisodePanel]:
     """Best, median and worst episode of an evaluation: video, score over time, ground-truth progress."""
     panels = []
     folder = evaluation_folder(evaluation.run, evaluation.config)
@@ -124,7 +123,7 @@ def episode_panels(name: str, evaluation: Evaluation, task: Task, scorer: Scorer
         states: NDArray[np.float64] = evaluation.traces["qpos"][index]
         video = folder / f"{which}.mp4"
         if not video.exists():
-            write_video(states, task, video)
+            write_video(states, video)
         panels.append(
             EpisodePanel(
                 title=f"{name}: {which}",
@@ -192,7 +191,6 @@ def compare(
     tasks = {json.loads(meta["dataset"]["env_spec"])["kwargs"]["task"] for meta in metas.values()}
     if len(tasks) != 1:
         raise BadInput(f"a report compares runs of one task, got {', '.join(sorted(tasks))}; write one report per task")
-    task = get_task(tasks.pop())
     rows = [method_row(method, evaluations[method.name]) for method in methods]
     if source_id is not None:
         rows.insert(0, dataset_row(source_id, paper=paper_demo))
@@ -201,7 +199,7 @@ def compare(
     if goals:
         scorer = Scorer.load(data.dataset_path(next(iter(goals.values()))) / SCORER_FILE)
     shown = [method for method in methods if method.kind == "method"]
-    panels = [p for m in shown for p in episode_panels(m.name, evaluations[m.name][0], task, scorer)]
+    panels = [p for m in shown for p in episode_panels(m.name, evaluations[m.name][0], scorer)]
     if scorer is not None:
         scorer.states.flush()
     best = max((row for row in rows if row.kind == "method"), key=lambda row: row.mean, default=None)

@@ -37,11 +37,9 @@ class Config:
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Roll out, summarise, write videos."""
-    import json
     import time
 
     from zest_rl.evaluation import EvaluationConfig, evaluate, evaluation_folder
-    from zest_rl.tasks import get_task
     from zest_rl.videos import representative, write_video
 
     started = time.monotonic()
@@ -59,11 +57,9 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     seconds = time.monotonic() - started
     videos = {}
     if config.videos:
-        meta = json.loads((config.run / "meta.json").read_text())
-        task = get_task(json.loads(meta["dataset"]["env_spec"])["kwargs"]["task"])
         for name, index in representative(result.normalized()).items():
             path = folder / f"{name}.mp4"
-            videos[name] = str(path if path.exists() else write_video(result.traces["qpos"][index], task, path))
+            videos[name] = str(path if path.exists() else write_video(result.traces["qpos"][index], path))
     return {
         "run": str(config.run),
         **result.summary(),
