@@ -1,9 +1,19 @@
 from __future__ import annotations
 
+import json
 import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run in as many processes as there are cores
+settings.register_profile("zest", deadline=None, derandomize=True)  # a busy machine is no failure
+settings.load_profile("zest")
 
 
 @pytest.fixture(scope="session")
@@ -14,3 +24,116 @@ def visual_tasks() -> Path:
     if not folder.is_dir():
         pytest.skip("no Visual Tasks Dataset: set ZEST_VISUAL_TASKS to its folder")
     return folder
+
+
+COLLECTED = "zest/kitchen-micro-tiny-v0"
+
+
+@pytest.fixture(scope="session")
+def collected_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Minari root with `COLLECTED`: four noisy episodes of the expert, of which one fails. Read-only."""
+    from zest_rl import collect
+    from zest_rl.data_writer import write_dataset
+    from zest_rl.parallel import concatenate
+
+    behaviour = collect.Behaviour("micro", "expert", noise_max=1.0)
+    episodes = concatenate([collect.rollout(behaviour, index) for index in range(4)])
+    root = tmp_path_factory.mktemp("minari")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MINARI_DATASETS_PATH", str(root))
+        write_dataset(
+            COLLECTED,
+            collect.recordings(episodes),
+            env_spec=collect.env_spec("micro").to_json(),
+            ref_min_score=0.0,
+            ref_max_score=70.0,
+            algorithm_name="scripted expert with uniform action noise",
+            description="four episodes for tests",
+            zest={"collect": {"asked": {"task": "micro"}}},
+        )
+    return root
+
+
+@pytest.fixture
+def collected(collected_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Id of the tiny dataset, in a Minari root and beside a cache of this test's own."""
+    shutil.copytree(collected_root, tmp_path / "minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
+    return COLLECTED
+
+
+SHORT_HORIZON = 25
+
+
+@pytest.fixture(scope="session")
+def trained_root(collected_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A Minari root, a cache, and small policies trained on `COLLECTED` and a relabeled copy of it. Read-only.
+
+    ``runs/``: bc-0 and bc-1 (two seeds) and dt-0 on the scores, gt-0 a Decision Transformer on the ground truth; all
+    are evaluated for `SHORT_HORIZON` steps.
+    """
+    from zest_rl.cli import train
+    from zest_rl.cli.ui import SilentUi
+    from zest_rl.frames import Views
+    from zest_rl.relabel import relabel
+    from zest_rl.scorer import ScorerConfig
+
+    root = tmp_path_factory.mktemp("trained")
+    shutil.copytree(collected_root, root / "minari")
+    small = {"n_updates": 30, "log_every": 10, "hidden_size": 32, "n_layers": 1, "warmup_updates": 0, "threads": 1}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MINARI_DATASETS_PATH", str(root / "minari"))
+        patch.setenv("ZEST_CACHE", str(root / "cache"))
+        views = Views("micro", n_views=1, size=96, tolerance=0.05)
+        scored = relabel(COLLECTED, ScorerConfig(views, "same-scene"), n_workers=1).dataset_id
+        for name, dataset in (("bc-0", scored), ("bc-1", scored), ("dt-0", scored), ("gt-0", COLLECTED)):
+            agent, seed = "bc" if name.startswith("bc") else "dt", int(name[-1])
+            config = train.CONFIGS[agent](
+                dataset=dataset, run_dir=root / "runs" / name, seed=seed, device="cpu", **small
+            )
+            train.run(config, SilentUi())
+    for path in root.glob("runs/*/meta.json"):
+        meta = json.loads(path.read_text())
+        spec = json.loads(meta["dataset"]["env_spec"]) | {"max_episode_steps": SHORT_HORIZON}
+        meta["dataset"]["env_spec"] = json.dumps(spec)
+        path.write_text(json.dumps(meta))
+    return root
+
+
+@pytest.fixture
+def trained(trained_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder ``runs`` of `trained_root`, with the Minari root and the cache, for this test alone."""
+    shutil.copytree(trained_root, tmp_path / "trained")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "trained" / "minari"))
+    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "trained" / "cache"))
+    return tmp_path / "trained" / "runs"
+
+
+@dataclass(frozen=True)
+class Disk:
+    """A file system of its own in memory."""
+
+    path: Path
+
+    def fill(self, free: int) -> None:
+        """Leave `free` bytes."""
+        size = shutil.disk_usage(self.path).free - free
+        (self.path / "ballast").write_bytes(bytes(size))
+
+    def make_read_only(self) -> None:
+        subprocess.run(["mount", "-o", "remount,ro", str(self.path)], check=True)
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Disk]:
+    """An empty disk of 8 MB that a test may fill or make read-only."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(folder)]
+    if os.geteuid() != 0 or subprocess.run(mount, capture_output=True).returncode != 0:
+        pytest.skip("mounting a small disk needs root and a system that permits it")
+    try:
+        yield Disk(folder)
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)

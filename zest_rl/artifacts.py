@@ -11,6 +11,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -126,7 +127,7 @@ def staged_folder(final: Path) -> Iterator[Path]:
     What an earlier, killed process left in the staging place is removed first; hold `lock` around this.
 
     Raises:
-        ZestError: the place cannot be written to.
+        ZestError: the place cannot be written to (read-only, full, or a folder called `final` is there already).
     """
     staging = final.parent / f".{final.name}.staging"
     try:
@@ -140,6 +141,8 @@ def staged_folder(final: Path) -> Iterator[Path]:
             _fsync(path)
         staging.rename(final)
         _fsync(final.parent)
+    except OSError as error:
+        raise ZestError(f"cannot write {final}: {error.strerror or error}; nothing was left behind") from error
     finally:
         shutil.rmtree(staging, ignore_errors=True)
 
@@ -192,17 +195,26 @@ def git_revision() -> str | None:
     return out.stdout.strip()
 
 
-def provenance() -> dict[str, Any]:
-    """Return what made an artifact: command, versions, git revision, machine. JSON-ready, without host paths."""
-    versions = {}
+def versions() -> dict[str, str]:
+    """Return the versions of this package and of those of `PACKAGES` that are installed."""
+    found = {}
     for name in ("zest-rl", *PACKAGES):
         try:
-            versions[name] = importlib.metadata.version(name)
+            found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
+    return found
+
+
+def provenance() -> dict[str, Any]:
+    """Return what made an artifact: command, versions, git revision, machine. JSON-ready, without host paths.
+
+    The folders of absolute paths in the command are left out: ``--goal=/home/me/goals`` becomes ``--goal=…/goals``.
+    """
+    arguments = [re.sub(r"(?<![^=:@,])/(?!/)(?:[^,]*/)?", "…/", word) for word in sys.argv[1:]]
     return {
-        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-        "versions": versions,
+        "command": " ".join([Path(sys.argv[0]).name, *arguments]),
+        "versions": versions(),
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",
         "git_revision": git_revision(),

@@ -27,6 +27,8 @@ EPISODES_PER_JOB = 5
 REFERENCE_STREAM = 2**31
 """Episodes from this index on serve the reference returns; datasets stay below it."""
 LARGEST_NOISE = 2.0
+N_REFERENCE = 100
+"""Episodes that measure the expert."""
 N_NOTHING = 10
 """Episodes of the robot doing nothing: their returns hardly differ."""
 Arrays = dict[str, NDArray[Any]]
@@ -52,6 +54,8 @@ class Behaviour:
             )
         if self.policy not in ("expert", "nothing"):
             raise BadInput(f"policy must be 'expert' or 'nothing', got {self.policy!r}")
+        if self.seed < 0:
+            raise BadInput(f"seed must be 0 or positive, got {self.seed}")
 
 
 def env_spec(task: str, init_noise: float = 0.05) -> gymnasium.envs.registration.EnvSpec:
@@ -125,7 +129,8 @@ def run_behaviour(
 
 def behaviour_folder(behaviour: Behaviour) -> Path:
     """Where `run_behaviour` keeps finished parts."""
-    key = {**asdict(behaviour), "env": [ENV_ID, HORIZON], "versions": artifacts.provenance()["versions"]}
+    code = [artifacts.hash_file(Path(__file__).with_name(name)) for name in ("collect.py", "envs.py", "experts.py")]
+    key = {**asdict(behaviour), "code": code, "versions": artifacts.versions()}
     return artifacts.cache_dir() / "episodes" / artifacts.hash_json(key)[:20]
 
 
@@ -143,7 +148,7 @@ class References:
 
 def measure_references(
     behaviour: Behaviour,
-    n_episodes: int = 100,
+    n_episodes: int = N_REFERENCE,
     *,
     n_workers: int | None = None,
     on_progress: Callable[[int], None] | None = None,
@@ -198,8 +203,11 @@ def calibrate(
         on_round: called with (noise_max, percent) after each.
 
     Raises:
+        BadInput: `target` is not in (0, 100].
         ZestError: no level within `tolerance` was found.
     """
+    if not 0 < target <= 100:
+        raise BadInput(f"the level to calibrate to must be in (0, 100] percent of the expert, got {target}")
     low, high = 0.0, LARGEST_NOISE
     for _ in range(n_rounds):
         noise_max = round((low + high) / 2, 4)

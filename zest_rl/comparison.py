@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,13 +15,15 @@ from numpy.typing import NDArray
 
 from zest_rl import artifacts, data, metrics
 from zest_rl.errors import BadInput
-from zest_rl.evaluation import Evaluation, evaluation_folder, read_evaluation
+from zest_rl.evaluation import Evaluation, EvaluationConfig, check_finished, evaluation_folder, read_evaluation
 from zest_rl.images import list_images, read_image
 from zest_rl.relabel import GOAL_FOLDER, SCORER_FILE
 from zest_rl.report import Curve, EpisodePanel, GoalPanel, MethodRow, Report, Scatter
 from zest_rl.report.data import Kind
 from zest_rl.scorer import Scorer
 from zest_rl.videos import FPS, representative, write_video
+
+MIN_EPISODES_TO_RANK = 3
 
 
 @dataclass(frozen=True)
@@ -36,20 +39,67 @@ class Method:
     """The paper's figure, in percent of the expert."""
 
 
+def methods_of_runs(runs: Sequence[Path]) -> tuple[Method, ...]:
+    """Make one method of the runs that differ in their training seed alone.
+
+    A method is called after its agent and goal; where that does not tell two apart, also by the settings that do.
+
+    Raises:
+        BadInput: a folder is no finished run, or two runs are the same training with the same seed.
+    """
+    groups: dict[str, dict[int, Path]] = {}
+    settings: dict[str, dict[str, Any]] = {}
+    for run in runs:
+        meta = read_meta(run)
+        dataset = f"{meta['dataset']['id']} ({meta['data_sha256'][:8]})"
+        own = {"name": _short_name(meta), **meta["config"], "n_updates": meta["n_updates"], "dataset": dataset}
+        key = artifacts.hash_json(own)
+        settings[key] = own
+        earlier = groups.setdefault(key, {}).setdefault(meta["seed"], run)
+        if earlier != run:
+            raise BadInput(f"{earlier} and {run} are the same training with the same seed; give one of them")
+    methods = []
+    for group, seeds in groups.items():
+        own = settings[group]
+        others = [other for other in settings.values() if other["name"] == own["name"]]
+        telling = [key for key in own if any(other[key] != own[key] for other in others)]
+        name = ", ".join([own["name"], *(f"{key} {own[key]}" for key in telling)])
+        methods.append(Method(name, tuple(seeds.values())))
+    return tuple(methods)
+
+
+def read_meta(run: Path) -> dict[str, Any]:
+    """Read the ``meta.json`` of a finished run.
+
+    Raises:
+        BadInput: the folder is no finished run.
+    """
+    check_finished(run)
+    meta: dict[str, Any] = artifacts.read_json(run / "meta.json")
+    return meta
+
+
+def goal_name(meta: dict[str, Any]) -> str | None:
+    """Short name of the goal whose scores a run was trained on; None for ground-truth rewards."""
+    relabel = meta["dataset"]["zest"].get("relabel")
+    return None if relabel is None else Path(relabel["scorer"]["config"]["goal"]).name
+
+
+def _short_name(meta: dict[str, Any]) -> str:
+    agent = str(meta["agent"]).upper()
+    return agent if agent == "BC" else f"{agent} on {goal_name(meta) or 'ground truth'}"
+
+
 def latest_evaluation(run: Path) -> Evaluation:
     """Read the newest evaluation of a run.
 
     Raises:
         BadInput: the folder is no run, or it was not evaluated.
     """
+    check_finished(run)
     results = sorted(run.glob("evaluations/*/result.json"), key=lambda path: path.stat().st_mtime)
     if not results:
-        done = (run / "meta.json").exists()
-        raise BadInput(
-            f"{run} holds no evaluation; run `zest evaluate {run}` first"
-            if done
-            else f"{run} is not the folder of a finished training; give folders that `zest train` left"
-        )
+        raise BadInput(f"{run} holds no evaluation; run `zest evaluate {run}` first")
     return read_evaluation(results[-1].parent)
 
 
@@ -99,7 +149,9 @@ def goal_scatter(name: str, dataset_id: str) -> Scatter:
     """ZeST return against ground-truth return of a relabeled dataset's episodes."""
     zest = np.array([score[1:].sum() for score in data.read_scores(dataset_id)], dtype=np.float32)
     truth = np.array([e.episode_return for e in data.read_ground_truth(dataset_id)], dtype=np.float32)
-    rho = metrics.spearman(zest.astype(np.float64), truth.astype(np.float64))
+    rho = metrics.Estimate(math.nan, math.nan, math.nan)
+    if len(zest) >= MIN_EPISODES_TO_RANK:
+        rho = metrics.spearman(zest.astype(np.float64), truth.astype(np.float64))
     return Scatter(name, zest, truth, rho.value, (rho.low, rho.high))
 
 
@@ -168,6 +220,7 @@ def compare(
     *,
     source_id: str | None,
     goals: dict[str, str],
+    config: EvaluationConfig | None = None,
     paper_demo: float | None = None,
     caveats: Sequence[str] = (),
     details: dict[str, Any] | None = None,
@@ -179,6 +232,7 @@ def compare(
         methods: rows, in the order of the table.
         source_id: the collected dataset, for the "Demo" row; None leaves the row out.
         goals: name → relabeled dataset.
+        config: which evaluation of each run; None takes the newest.
         paper_demo: the paper's figure for "Demo", in percent.
         caveats: sentences shown at the end.
         details: shown as collapsed JSON, beside the runs' own meta.
@@ -186,11 +240,17 @@ def compare(
     Raises:
         BadInput: a run was not evaluated, or is of another task than the others.
     """
-    evaluations = {method.name: [latest_evaluation(run) for run in method.runs] for method in methods}
-    metas = {str(run): artifacts.read_json(run / "meta.json") for method in methods for run in method.runs}
+    metas = {str(run): read_meta(run) for method in methods for run in method.runs}
     tasks = {json.loads(meta["dataset"]["env_spec"])["kwargs"]["task"] for meta in metas.values()}
     if len(tasks) != 1:
         raise BadInput(f"a report compares runs of one task, got {', '.join(sorted(tasks))}; write one report per task")
+    evaluations = {
+        method.name: [
+            latest_evaluation(run) if config is None else read_evaluation(evaluation_folder(run, config))
+            for run in method.runs
+        ]
+        for method in methods
+    }
     rows = [method_row(method, evaluations[method.name]) for method in methods]
     if source_id is not None:
         rows.insert(0, dataset_row(source_id, paper=paper_demo))
@@ -218,5 +278,20 @@ def compare(
         scatters=tuple(scatters.values()),
         curves=tuple(curve for method in methods if (curve := learning_curve(method)) is not None),
         details={**(details or {}), **{f"run {Path(run).name}": meta for run, meta in metas.items()}},
-        caveats=tuple(caveats),
+        caveats=(*caveats, *_unequal_starts(evaluations)),
     )
+
+
+def _unequal_starts(evaluations: dict[str, list[Evaluation]]) -> list[str]:
+    """Say so when methods did not meet the same starts."""
+    starts = {
+        name: {(evaluation.config.seed, evaluation.config.n_episodes) for evaluation in group}
+        for name, group in evaluations.items()
+    }
+    if len(set().union(*starts.values())) == 1:
+        return []
+    listed = "; ".join(
+        f"{name}: {' and '.join(f'{n} from seed {seed}' for seed, n in sorted(group))}"
+        for name, group in starts.items()
+    )
+    return [f"The methods were not evaluated on the same starts, so their numbers are not paired ({listed})."]

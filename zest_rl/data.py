@@ -89,13 +89,28 @@ def read_metadata(dataset_id: str) -> dict[str, Any]:
                 )
     metadata: dict[str, Any] = artifacts.read_json(folder / METADATA_FILE)
     for key in ("env_spec", "eval_env_spec"):
-        entry_point = str(json.loads(metadata[key]).get("entry_point")) if metadata.get(key) else ""
-        if entry_point and not entry_point.startswith(TRUSTED_ENTRY_POINTS):
-            raise BadInput(
-                f"the {key} of dataset {dataset_id} would run code of {entry_point!r}; only "
-                f"{', '.join(p + '*' for p in TRUSTED_ENTRY_POINTS)} are trusted. Remove {key} from its metadata.json"
-            )
+        if metadata.get(key):
+            check_env_spec(metadata[key], f"the {key} of dataset {dataset_id}")
     return metadata
+
+
+def check_env_spec(env_spec: str, what: str) -> None:
+    """Refuse a Gymnasium EnvSpec (JSON) that would run code of an unknown package: of its environment or a wrapper.
+
+    Raises:
+        BadInput: such an entry point, or not an EnvSpec; `what` names it in the message.
+    """
+    try:
+        spec = json.loads(env_spec)
+        entry_points = [str(part["entry_point"]) for part in (spec, *spec.get("additional_wrappers", ()))]
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise BadInput(f"{what} is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
+    for entry_point in entry_points:
+        if not entry_point.startswith(TRUSTED_ENTRY_POINTS):
+            raise BadInput(
+                f"{what} would run code of {entry_point!r}; only {', '.join(p + '*' for p in TRUSTED_ENTRY_POINTS)} "
+                "are trusted. Remove it from metadata.json if you do not need the environment"
+            )
 
 
 @contextmanager
@@ -133,6 +148,8 @@ def _each(dataset_id: str, read: Callable[[h5py.Group], Any]) -> list[Any]:
                 results.append(read(file[name]))
             except BadInput as error:
                 raise BadInput(f"{name} of dataset {dataset_id}: {error}") from error
+            except OSError as error:
+                raise ZestError(f"{name} of dataset {dataset_id} is damaged ({error}); make it again") from error
     return results
 
 
@@ -165,7 +182,7 @@ def read_states(dataset_id: str) -> list[NDArray[np.float64]]:
 
     def read(group: h5py.Group) -> NDArray[np.float64]:
         qpos = _array(group, "infos/state/qpos", np.float64, dataset_id)
-        n_steps = len(group["rewards"])
+        n_steps = len(_array(group, "rewards", np.float32, dataset_id))
         if n_steps == 0:
             raise BadInput("an episode must have at least 1 step, got 0; drop empty episodes from the dataset")
         if qpos.ndim != 2 or len(qpos) != n_steps + 1:

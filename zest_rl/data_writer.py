@@ -5,6 +5,7 @@ The layout on disk is drawn in `zest_rl.data`, the alignment of the arrays in `z
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
 import os
 import shutil
@@ -21,7 +22,8 @@ from numpy.typing import NDArray
 from zest_rl import artifacts
 from zest_rl.data import DATA_FILE, MANIFEST_FILE, METADATA_FILE, dataset_path, exists, read_episodes, read_metadata
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.types import FloatArray
+from zest_rl.parallel import die_with_parent
+from zest_rl.types import Episode, FloatArray
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,12 @@ class Recording:
     gt_success: NDArray[np.bool_]
     """(T+1,) bool."""
 
+    def __post_init__(self) -> None:
+        Episode(self.obs, self.actions, self.gt_reward[1:], self.terminated)  # it checks shapes, types, finiteness
+        wrong = [name for name in ("qpos", "qvel", "gt_success") if len(getattr(self, name)) != len(self.obs)]
+        if wrong:
+            raise BadInput(f"{' and '.join(wrong)} must have T + 1 = {len(self.obs)} rows, as many as obs")
+
 
 def _in_child(build: Callable[..., None], *args: object) -> None:
     """Run an HDF5 write in a process of its own: on a full disk the library kills its process."""
@@ -54,17 +62,20 @@ def _in_child(build: Callable[..., None], *args: object) -> None:
     try:
         message = receive.recv()
     except EOFError:
-        message = "the writing process died; is the disk full?"
+        message = "the writing process died, as HDF5 does on a full disk"
     child.join()
     if message is not None:
-        raise ZestError(f"the dataset could not be written: {message}. Nothing was left behind; try again")
+        raise ZestError(f"the dataset could not be written: {message}; nothing was left behind, try again")
 
 
 def _report_errors(send: Any, build: Callable[..., None], *args: object) -> None:
+    die_with_parent()  # else it would go on writing where the next try writes
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # on a full disk HDF5 prints hundreds of tracebacks
     try:
         build(*args)
     except Exception as error:
-        send.send(f"{type(error).__name__}: {error}")
+        full = os.strerror(errno.ENOSPC) in str(error)
+        send.send("the disk is full" if full else f"{type(error).__name__}: {error}")
     else:
         send.send(None)
 
@@ -75,14 +86,38 @@ def _set_metadata(path: Path, **values: object) -> None:
     artifacts.write_json(path, metadata)
 
 
-def _publish(staging: Path, dataset_id: str, n_steps: Sequence[int]) -> None:
-    """Check a staged dataset against what was meant to be written, and write its manifest."""
+def _publish(staging: Path, dataset_id: str, meant: Sequence[Mapping[str, NDArray[Any]]]) -> None:
+    """Compare a staged dataset with the arrays that were meant to be written, and write its manifest.
+
+    h5py drops the error of a write that fails while an array is closed, so only reading shows that all is there.
+    """
     with h5py.File(staging / DATA_FILE, "r") as file:
-        lengths = [len(file[f"episode_{i}"]["rewards"]) for i in range(len(file))]
-        if lengths != list(n_steps):
-            raise ZestError(f"dataset {dataset_id} was not written whole ({len(lengths)} of {len(n_steps)} episodes)")
+        for i, arrays in enumerate(meant):
+            for name, array in arrays.items():
+                stored = file.get(f"episode_{i}/{name}")
+                if stored is None or not np.array_equal(stored[()], array):
+                    raise ZestError(f"{name} of episode {i} of {dataset_id} was not written whole; is the disk full?")
+        if len(file) != len(meant):
+            raise ZestError(f"{len(file)} of {len(meant)} episodes of {dataset_id} were written; try again")
     digests = {name: artifacts.hash_file(staging / name) for name in (DATA_FILE, METADATA_FILE)}
     artifacts.write_json(staging / MANIFEST_FILE, digests)
+
+
+def _stored(recording: Recording) -> dict[str, NDArray[Any]]:
+    """Return the arrays of one episode under the names that they have on disk."""
+    ends = np.zeros(len(recording.actions), dtype=bool)
+    ends[-1] = True
+    return {
+        "observations": recording.obs,
+        "actions": recording.actions,
+        "rewards": recording.gt_reward[1:],
+        "terminations": ends & recording.terminated,
+        "truncations": ends & (not recording.terminated),
+        "infos/state/qpos": recording.qpos,
+        "infos/state/qvel": recording.qvel,
+        "infos/gt/reward": recording.gt_reward,
+        "infos/gt/success": recording.gt_success,
+    }
 
 
 def _build_new(root: Path, dataset_id: str, recordings: Sequence[Recording], fields: Mapping[str, Any]) -> None:
@@ -94,24 +129,12 @@ def _build_new(root: Path, dataset_id: str, recordings: Sequence[Recording], fie
     spec = gymnasium.envs.registration.EnvSpec.from_json(fields["env_spec"])
     buffers = []
     for i, recording in enumerate(recordings):
-        n_steps = len(recording.actions)
-        ends = np.zeros(n_steps, dtype=bool)
-        ends[-1] = True
-        buffers.append(
-            EpisodeBuffer(
-                id=i,
-                seed=recording.seed,
-                observations=recording.obs,
-                actions=recording.actions,
-                rewards=recording.gt_reward[1:],
-                terminations=ends & recording.terminated,
-                truncations=ends & (not recording.terminated),
-                infos={
-                    "state": {"qpos": recording.qpos, "qvel": recording.qvel},
-                    "gt": {"reward": recording.gt_reward, "success": recording.gt_success},
-                },
-            )
-        )
+        arrays = _stored(recording)
+        infos = {
+            "state": {key: arrays.pop(f"infos/state/{key}") for key in ("qpos", "qvel")},
+            "gt": {key: arrays.pop(f"infos/gt/{key}") for key in ("reward", "success")},
+        }
+        buffers.append(EpisodeBuffer(id=i, seed=recording.seed, infos=infos, **arrays))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Minari warns of every optional field that is not given
         minari.create_dataset_from_buffers(
@@ -153,10 +176,12 @@ def write_dataset(
         The dataset's folder.
 
     Raises:
-        BadInput: bad id, or a dataset of this id exists.
+        BadInput: bad id, no episodes, or a dataset of this id exists.
         ZestError: the disk is full or read-only; nothing is left behind.
     """
     final = dataset_path(dataset_id)
+    if not recordings:
+        raise BadInput("a dataset must have at least 1 episode, got 0; collect some first")
     fields = {
         "env_spec": env_spec,
         "ref_min_score": ref_min_score,
@@ -174,7 +199,7 @@ def write_dataset(
             (staging / "root" / dataset_id / "data").rename(staging / "data")
             shutil.rmtree(staging / "root")
             _set_metadata(staging / METADATA_FILE, zest=dict(zest))
-            _publish(staging, dataset_id, [len(r.actions) for r in recordings])
+            _publish(staging, dataset_id, [_stored(recording) for recording in recordings])
     return final
 
 
@@ -241,5 +266,9 @@ def write_relabeled(
                 zest={**metadata.get("zest", {}), **zest},
             )
             extra(staging)
-            _publish(staging, dataset_id, n_steps)
+            _publish(
+                staging,
+                dataset_id,
+                [{"rewards": r, "infos/zest/score": s} for r, s in zip(rewards, scores, strict=True)],
+            )
     return final

@@ -9,10 +9,10 @@ embedded beside it: networks are exact only up to about 1e-6 across batch sizes 
 
 from __future__ import annotations
 
+import atexit
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from multiprocessing.util import Finalize
 from pathlib import Path
 
 import numpy as np
@@ -39,25 +39,25 @@ class EmbedConfig:
     device: str = "auto"
 
     def load_embedder(self) -> Embedder:
-        """Return the embedder; its network is loaded at the first picture."""
-        return load_embedder(self.embedder, device=self.device, precision=self.precision)
+        """Return the embedder, shared within the process; the default's network is loaded at its first picture."""
+        return _embedder(self.embedder, self.precision, self.device)
 
 
 @functools.cache
 def _renderer(views: Views) -> StateRenderer:
     renderer = views.renderer()
-    Finalize(None, renderer.close, exitpriority=0)  # in worker processes, too; left open, GL complains at exit
+    atexit.register(renderer.close)  # left open, or closed after the GL library, it complains when the process ends
     return renderer
 
 
 @functools.lru_cache(maxsize=2)
-def _embedder(config: EmbedConfig) -> Embedder:
-    return config.load_embedder()
+def _embedder(uri: str, precision: Precision, device: str) -> Embedder:
+    return load_embedder(uri, device=device, precision=precision)
 
 
 def _embed_states(job: tuple[EmbedConfig, NDArray[np.float64]]) -> dict[str, NDArray[np.generic]]:
     config, states = job
-    renderer, embedder = _renderer(config.views), _embedder(config)
+    renderer, embedder = _renderer(config.views), config.load_embedder()
     with one_thread():
         embeddings = [embedder.embed_images(list(renderer.render(state))) for state in states]
     return {"keys": states, "embeddings": np.stack(embeddings)}
@@ -70,7 +70,7 @@ class StateEmbedder:
         """Open the cache of `config` (created when something is first written)."""
         self.config = config
         self.n_workers = n_workers
-        self.embedder = _embedder(config)
+        self.embedder = config.load_embedder()
         self.n_embedded = 0
         """States that were not in the cache and had to be rendered and embedded."""
         digest = artifacts.hash_json([config.views.fingerprint(), self.embedder.fingerprint])

@@ -1,8 +1,8 @@
 """Policy + environment (+ scorer for the online return-to-go) → episode results. Imports no training.
 
-Episodes run in lockstep, `EPISODES_PER_JOB` at a time, one job per core; every policy meets the same starts (paired
+Episodes run in lockstep, `EPISODES_PER_JOB` at a time, one part per core; every policy meets the same starts (paired
 seeds). The Decision Transformer's return-to-go falls by the *online ZeST score* of each new state, in the units of the
-rewards it was trained on; ground-truth rewards are recorded and shown to nobody.
+rewards it was trained on. Ground-truth rewards are recorded, and shown to no policy but one that was trained on them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import gymnasium
 import numpy as np
@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 
 from zest_rl import artifacts
 from zest_rl.agents import Policy, load_policy
-from zest_rl.errors import BadInput, ZestError
+from zest_rl.data import check_env_spec
+from zest_rl.envs import ENV_ID
+from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.metrics import bootstrap, iqm, normalized_return, wilson
 from zest_rl.parallel import chunks, concatenate, map_jobs, one_thread, read_arrays
 from zest_rl.relabel import SCORER_FILE, Reward
@@ -27,7 +29,8 @@ from zest_rl.scorer import Scorer
 from zest_rl.types import EpisodeResult
 
 Rtg = Literal["online", "constant", "schedule"]
-EPISODES_PER_JOB = 25
+EPISODES_PER_JOB = 5
+"""Small enough that all cores have work and a cut evaluation loses little; a batch of 5 hardly costs more per step."""
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -49,6 +52,8 @@ class EvaluationConfig:
             problems.append(f"n_episodes must be at least 1, got {self.n_episodes}")
         if self.seed < 0:
             problems.append(f"seed must be at least 0, got {self.seed}")
+        if self.rtg not in get_args(Rtg):
+            problems.append(f"unknown rtg {self.rtg!r}; {nearest(self.rtg, get_args(Rtg))}")
         if not 0 <= self.target_quantile <= 1:
             problems.append(f"target_quantile must be in [0, 1], got {self.target_quantile}")
         if problems:
@@ -119,13 +124,21 @@ def rollout(
         scorer: scores each new state; needed for ``rtg="online"`` with ZeST rewards.
 
     Returns:
-        gt_reward (N, T+1) float32, gt_success (N, T+1) bool, qpos (N, T+1, nq), n_steps (N,), score (N, T+1) if scored.
+        gt_reward (N, T+1) float32, gt_success (N, T+1) bool, qpos (N, T+1, nq), and score (N, T+1) if scored.
+
+    With ``rtg="online"`` the return-to-go of a policy that was trained on ground-truth rewards falls by those: the
+    upper bound of the comparison.
 
     Raises:
-        ZestError: the policy was trained on ground-truth rewards and ``rtg="online"`` is asked for with no scorer; its
-            return-to-go then falls by the environment's reward (the upper bound of the comparison).
+        BadInput: the environment is not the kitchen, or the policy needs scores and there is no scorer.
     """
-    spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
+    if scorer is None and uses_online_scores(policy, config):
+        raise BadInput(
+            "the policy was trained on ZeST scores, so rtg 'online' needs a scorer; give it, or use 'constant'"
+        )
+    spec = _kitchen_spec(env_spec)
+    horizon = spec.max_episode_steps
+    assert horizon is not None
     envs = [gymnasium.make(spec) for _ in seeds]
     resets = [env.reset(seed=seed) for env, seed in zip(envs, seeds, strict=True)]
     obs = np.stack([o for o, _ in resets])
@@ -134,9 +147,6 @@ def rollout(
     trace: dict[str, list[Any]] = {"gt_reward": [], "gt_success": [], "qpos": []}
     first = np.stack([info["state"]["qpos"] for info in infos])
     scores = [scorer.score_now(first, first)] if scorer is not None else []
-    horizon = spec.max_episode_steps
-    if horizon is None:
-        raise ZestError("the environment has no max_episode_steps; scores are summed over a fixed horizon")
 
     def record() -> None:
         trace["gt_reward"].append(np.array([info["gt"]["reward"] for info in infos]))
@@ -165,6 +175,18 @@ def rollout(
     return arrays
 
 
+def _kitchen_spec(env_spec: str) -> gymnasium.envs.registration.EnvSpec:
+    """Read the EnvSpec of a run; the run may come from somebody else, so it must not run code of its choice."""
+    check_env_spec(env_spec, "the environment of the run")
+    spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
+    if spec.id != ENV_ID or spec.max_episode_steps is None:
+        raise BadInput(
+            f"evaluation needs {ENV_ID} with a horizon, got {spec.id} with max_episode_steps {spec.max_episode_steps}; "
+            "train on a dataset of `zest collect`"
+        )
+    return spec
+
+
 def _decrement(
     policy: Policy, config: EvaluationConfig, step: int, rewards: NDArray[np.float32]
 ) -> NDArray[np.float32]:
@@ -178,14 +200,15 @@ def _decrement(
 
 
 @functools.lru_cache(maxsize=2)
-def _scorer(path: Path) -> Scorer:
+def _scorer(path: Path, sha256: str) -> Scorer:
+    """Load a scorer once per process; `sha256` tells a changed file apart."""
     return Scorer.load(path, n_workers=1)
 
 
 def _evaluate_part(job: tuple[Path, EvaluationConfig, range, bool, str]) -> Arrays:
     run, config, seeds, scored, device = job
     policy = load_policy(run, device=device)
-    scorer = _scorer(run / SCORER_FILE) if scored else None
+    scorer = _scorer(run / SCORER_FILE, artifacts.hash_file(run / SCORER_FILE)) if scored else None
     with one_thread():
         arrays = rollout(policy, policy.meta["dataset"]["env_spec"], seeds, config, scorer)
     if scorer is not None:
@@ -216,6 +239,7 @@ def evaluate(
         BadInput: the run was not trained to its end, or has no scorer although scores are asked for.
         ZestError: a part of the run is damaged.
     """
+    check_finished(run)
     run = run.resolve()
     policy = load_policy(run, device=device)
     scored = score or uses_online_scores(policy, config)
@@ -261,6 +285,20 @@ def evaluate(
         },
     )
     return result
+
+
+def check_finished(run: Path) -> None:
+    """Refuse what is not the folder of a finished training.
+
+    Raises:
+        BadInput: it is not; the message says whether there is an unfinished one.
+    """
+    if not (run / "meta.json").exists():
+        raise BadInput(
+            f"the training in {run} is not finished; type its `zest train` command again to go on"
+            if (run / "run.json").exists()
+            else f"{run} is not the folder of a training; give a folder that `zest train` left"
+        )
 
 
 def read_evaluation(folder: Path) -> Evaluation:

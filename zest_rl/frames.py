@@ -32,8 +32,8 @@ class Views:
 
     def __post_init__(self) -> None:
         get_task(self.task)
-        if not self.tolerance >= 0:
-            raise BadInput(f"tolerance must be a number >= 0 (rad or m), got {self.tolerance}")
+        if not 0 <= self.tolerance < np.inf:
+            raise BadInput(f"tolerance must be a finite number >= 0 (rad or m), got {self.tolerance}")
 
     @property
     def render_config(self) -> RenderConfig:

@@ -74,7 +74,7 @@ def read_folder(folder: Path, name: str | None = None) -> GoalSpec:
             raise BadInput(
                 f"a goal folder must hold init/ (pictures of the start) and goal/ (pictures of the goal); {folder} "
                 + (
-                    "does not exist"
+                    "is not a folder"
                     if found is None
                     else f"has no {part}/, it holds {', '.join(found[:8]) or 'nothing'}"
                 )

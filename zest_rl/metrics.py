@@ -90,12 +90,13 @@ def spearman(a: Values, b: Values, *, seed: int = 0, n_resamples: int = 1000) ->
             return float("nan")
         return float(stats.spearmanr(x, y).statistic)
 
+    value = rho(a, b)
+    if np.isnan(value):
+        return Estimate(value, value, value)
     rng = np.random.default_rng(seed)
     draws = (rng.integers(len(a), size=len(a)) for _ in range(n_resamples))
-    low, high = (
-        np.nanquantile([rho(a[i], b[i]) for i in draws], [0.025, 0.975]) if rho(a, b) == rho(a, b) else (np.nan,) * 2
-    )
-    return Estimate(rho(a, b), float(low), float(high))
+    low, high = np.nanquantile([rho(a[i], b[i]) for i in draws], [0.025, 0.975])
+    return Estimate(value, float(low), float(high))
 
 
 def wilson(n_successes: int, n: int) -> Estimate:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import threading
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,7 @@ from zest_rl.errors import ZestError
 
 Job = TypeVar("Job")
 Arrays = Mapping[str, NDArray[Any]]
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def n_cores() -> int:
@@ -27,9 +29,35 @@ def n_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _start_worker() -> None:
-    """Keep each worker on one core: results then do not depend on the number of workers, and none waits for another."""
-    os.environ["OMP_NUM_THREADS"] = os.environ["MKL_NUM_THREADS"] = "1"
+def die_with_parent() -> None:
+    """End this child process as soon as its parent is gone, be it killed: nobody else would end it."""
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def _one_thread_for_children() -> Iterator[None]:
+    """Let processes that are started within the context use one core each.
+
+    Their results then do not depend on the number of workers, and none waits for another. Set here and not in the
+    child, as the libraries read it when they are loaded.
+    """
+    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 @contextmanager
@@ -50,7 +78,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile):  # RuntimeError: damaged zip flags
         return None
 
 
@@ -99,9 +127,12 @@ def map_jobs(
                 on_done(name)
         return
     context = multiprocessing.get_context("spawn")  # fork is unsafe beside torch's and the GL library's threads
-    with ProcessPoolExecutor(n_workers, mp_context=context, initializer=_start_worker) as pool:
-        pending = {pool.submit(_run_job, work, jobs[name], folder / f"{name}.npz"): name for name in missing}
+    pool = ProcessPoolExecutor(n_workers, mp_context=context, initializer=die_with_parent)
+    with _one_thread_for_children(), pool:
+        pending: dict[Future[None], str] = {}
         try:
+            for name in missing:
+                pending[pool.submit(_run_job, work, jobs[name], folder / f"{name}.npz")] = name
             while pending:
                 done, _ = wait(pending, return_when=FIRST_COMPLETED)
                 for future in done:
@@ -111,8 +142,8 @@ def map_jobs(
                         on_done(name)
         except BrokenProcessPool as error:
             raise ZestError(
-                f"a worker process died while {len(pending) + 1} of {len(jobs)} parts were open (killed, or out of "
-                "memory); finished parts are kept, run the same command again to go on"
+                f"a worker process died before all of {len(jobs)} parts were done (killed, or out of memory); "
+                "finished parts are kept, run the same command again to go on"
             ) from error
         finally:
             for future in pending:

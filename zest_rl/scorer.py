@@ -19,9 +19,9 @@ from zest_rl import artifacts
 from zest_rl.embed import EmbedConfig, StateEmbedder
 from zest_rl.embedders import Precision
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.frames import Views, scene_pair
+from zest_rl.frames import Views, canonical_states, scene_pair
 from zest_rl.goals import SAME_SCENE, GoalSpec, embed_goal, read_goal
-from zest_rl.parallel import read_arrays, write_arrays
+from zest_rl.parallel import one_thread, read_arrays, write_arrays
 from zest_rl.scores import Features, Similarity, score_views, zero_deltas
 from zest_rl.tasks import get_task
 from zest_rl.types import FloatArray
@@ -138,8 +138,13 @@ class Scorer:
         Returns:
             (N,) float32 scores.
         """
-        pairs = np.stack([self.states.embed_now(first), self.states.embed_now(current)], axis=1)  # (N, 2, V, D)
-        return np.array([self._score(pair)[1] for pair in pairs], dtype=np.float32)
+        scores = np.empty(len(current), dtype=np.float32)
+        _, group = np.unique(canonical_states(first, self.config.views), axis=0, return_inverse=True)
+        for same in range(group.max() + 1):  # mostly one group: the objects start alike
+            rows = np.flatnonzero(group.reshape(-1) == same)
+            frames = np.concatenate([self.states.embed_now(first[rows[:1]]), self.states.embed_now(current[rows])])
+            scores[rows] = self._score(frames)[1:]
+        return scores
 
     def _score(self, embeddings: FloatArray) -> FloatArray:
         """(n, V, D) embeddings, the first of x_0 → (n,) scores."""
@@ -183,9 +188,10 @@ class Scorer:
             with safe_open(path, framework="numpy") as file:
                 described = json.loads(file.metadata()["scorer"])
                 starts, goals = file.get_tensor("starts"), file.get_tensor("goals")
-        except (OSError, SafetensorError, KeyError, TypeError) as error:
+            config, goal_fingerprint = ScorerConfig.from_dict(described["config"]), described["goal_sha256"]
+        except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
             raise ZestError(f"the scorer {path} cannot be read ({error}); relabel the dataset again") from error
-        scorer = cls(ScorerConfig.from_dict(described["config"]), starts, goals, described["goal_sha256"], **options)
+        scorer = cls(config, starts, goals, goal_fingerprint, **options)
         here = scorer.describe()
         changed = [key for key in ("embedder_sha256", "views_sha256") if here[key] != described[key]]
         if changed:
@@ -201,7 +207,8 @@ def _embed_goal_cached(goal: GoalSpec, embedder: Any) -> tuple[FloatArray, Float
     path = artifacts.cache_dir() / "goals" / f"{digest[:20]}.npz"
     cached = read_arrays(path)
     if cached is None:
-        starts, goals = embed_goal(goal, embedder)
+        with one_thread():
+            starts, goals = embed_goal(goal, embedder)
         write_arrays(path, {"starts": starts, "goals": goals})
         return starts, goals
     return cached["starts"], cached["goals"]

@@ -19,7 +19,7 @@ Features = Literal["raw", "delta"]
 Similarity = Literal["cos", "l2"]
 
 ZERO_DELTA = 1e-6
-"""A change shorter than this times ‖ψ(x_0)‖ has no direction: its cosine is defined as 0."""
+"""A change not longer than this times the embedding it starts from has no direction: its cosine is defined as 0."""
 
 
 def _check(name: str, embeddings: FloatArray, dim: int | None = None) -> Doubles:
@@ -36,22 +36,28 @@ def _check(name: str, embeddings: FloatArray, dim: int | None = None) -> Doubles
     return np.asarray(array, dtype=np.float64)
 
 
-def _cos(a: Doubles, b: Doubles, smallest: float = 0.0) -> Doubles:
-    """(N, D), (M, D) → (N, M) cosines; 0 where a row of either is not longer than `smallest`."""
-    length_a, length_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
+def _cos(a: Doubles, b: Doubles) -> Doubles:
+    """(N, D), (M, D) → (N, M) cosines; 0 where a row of either is zero."""
     products = a @ b.T
-    lengths = np.outer(length_a, length_b)
-    valid = np.outer(length_a > smallest, length_b > smallest)
-    return np.divide(products, lengths, out=np.zeros_like(products), where=valid)
+    lengths = np.outer(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1))
+    return np.divide(products, lengths, out=np.zeros_like(products), where=lengths > 0)
 
 
-def _similarity(a: Doubles, b: Doubles, similarity: Similarity, smallest: float) -> Doubles:
+def _similarity(a: Doubles, b: Doubles, similarity: Similarity) -> Doubles:
     """(N, D), (M, D) → (N, M)."""
     if similarity == "cos":
-        return _cos(a, b, smallest)
+        return _cos(a, b)
     if similarity == "l2":
         return -np.stack([np.linalg.norm(a - row, axis=1) for row in b], axis=1)
     raise BadInput(f"unknown similarity {similarity!r}; {nearest(similarity, ('cos', 'l2'))}")
+
+
+def _change(after: Doubles, before: Doubles) -> Doubles:
+    """`after` (N, D) − `before` (D,) or (N, D), with changes that have no direction (`ZERO_DELTA`) set to zero."""
+    change = after - before
+    still = np.linalg.norm(change, axis=1) <= ZERO_DELTA * np.linalg.norm(before, axis=-1)
+    change[still] = 0.0
+    return change
 
 
 def _mean_over_goals(similarities: Doubles) -> FloatArray:
@@ -75,7 +81,7 @@ def score_raw(frame_embeddings: FloatArray, goal_embeddings: FloatArray, similar
     """
     frames = _check("frame_embeddings", frame_embeddings)
     goals = _check("goal_embeddings", goal_embeddings, frames.shape[1])
-    return _mean_over_goals(_similarity(frames, goals, similarity, 0.0))
+    return _mean_over_goals(_similarity(frames, goals, similarity))
 
 
 def _pairs(starts: Doubles, goals: Doubles) -> NDArray[np.intp]:
@@ -104,7 +110,7 @@ def score_delta(
 ) -> FloatArray:
     """φ_t = mean over goals of α(ψ(x_t) − ψ(x_0), ψ(G_f) − ψ(G_0)) (Eq. 2), with G_0 from `pair_starts`.
 
-    A frame with ‖ψ(x_t) − ψ(x_0)‖ ≤ `ZERO_DELTA` · ‖ψ(x_0)‖ has cosine 0 (see `zero_deltas`).
+    A frame with ‖ψ(x_t) − ψ(x_0)‖ ≤ `ZERO_DELTA` · ‖ψ(x_0)‖ counts as unchanged: cosine 0 (see `zero_deltas`).
 
     Args:
         frame_embeddings: (T+1, D) embeddings of one episode's frames x_0 … x_T.
@@ -121,16 +127,14 @@ def score_delta(
     frames = _check("frame_embeddings", frame_embeddings)
     starts = _check("start_embeddings", start_embeddings, frames.shape[1])
     goals = _check("goal_embeddings", goal_embeddings, frames.shape[1])
-    changes = np.subtract(goals, starts[_pairs(starts, goals)])
-    smallest = ZERO_DELTA * float(np.linalg.norm(frames[0]))
-    return _mean_over_goals(_similarity(frames - frames[0], changes, similarity, smallest))
+    wanted = _change(goals, starts[_pairs(starts, goals)])
+    return _mean_over_goals(_similarity(_change(frames, frames[0]), wanted, similarity))
 
 
 def zero_deltas(frame_embeddings: FloatArray) -> NDArray[np.bool_]:
     """Which frames of an episode have no direction of change against x_0: (T+1, D) → (T+1,) bool."""
     frames = _check("frame_embeddings", frame_embeddings)
-    lengths = np.linalg.norm(frames - frames[0], axis=1)
-    return np.asarray(lengths <= ZERO_DELTA * np.linalg.norm(frames[0]))
+    return np.asarray((_change(frames, frames[0]) == 0).all(axis=1))
 
 
 def score_views(

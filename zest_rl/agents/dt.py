@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
-from transformers import DecisionTransformerConfig, DecisionTransformerModel
 
 from zest_rl.agents.base import (
     Agent,
@@ -111,6 +110,8 @@ class CheapDropout(nn.Dropout):
 
 def build_model(config: DTConfig, facts: DataFacts) -> nn.Module:
     """Return transformers' model, its unused parts (token table, observation and return heads) frozen."""
+    from transformers import DecisionTransformerConfig, DecisionTransformerModel  # 3 s that other agents do without
+
     model = DecisionTransformerModel(
         DecisionTransformerConfig(
             state_dim=facts.obs_dim,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from zest_rl.cli.ui import Ui
+from zest_rl.errors import BadInput
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,10 @@ class Config:
     n_workers: int | None = None
     """Processes; default one per core."""
 
+    def __post_init__(self) -> None:
+        if self.n_episodes < 1:
+            raise BadInput(f"n-episodes must be at least 1, got {self.n_episodes}")
+
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Measure the references, calibrate if asked to, roll out, write."""
@@ -37,7 +42,6 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
     from zest_rl import artifacts, collect, data, metrics
     from zest_rl.data_writer import write_dataset
-    from zest_rl.errors import BadInput
     from zest_rl.tasks import get_task
 
     get_task(config.task)
@@ -55,7 +59,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         return {**made_by["result"], "dataset": dataset_id, "path": str(path), "next": _next(dataset_id)}
 
     behaviour = collect.Behaviour(config.task, "expert", seed=config.seed, noise_max=config.noise_max or 0.0)
-    n_reference = 100
+    n_reference = collect.N_REFERENCE
     with ui.progress("reference returns (expert, doing nothing)", n_reference + collect.N_NOTHING) as advance:
         references = collect.measure_references(behaviour, n_reference, n_workers=config.n_workers, on_progress=advance)
     ui.say(f"expert: return {references.expert:.2f}, success {references.expert_success:.0%}")

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from zest_rl.cli.ui import Ui
+
+if TYPE_CHECKING:
+    from zest_rl.evaluation import EvaluationConfig
 
 
 @dataclass(frozen=True)
 class Config:
     """Evaluate a trained policy: normalized ground-truth return and success, with 95 % intervals."""
 
-    run: Annotated[Path, tyro.conf.Positional]
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """Folder that `zest train` left."""
     n_episodes: int = 50
     """Episodes; equal seeds give equal starts to every policy."""
@@ -39,21 +43,21 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Roll out, summarise, write videos."""
     import time
 
-    from zest_rl.evaluation import EvaluationConfig, evaluate, evaluation_folder
+    from zest_rl.evaluation import evaluate, evaluation_folder
     from zest_rl.videos import representative, write_video
 
     started = time.monotonic()
-    settings = EvaluationConfig(config.n_episodes, config.seed, config.rtg, config.target_quantile)
+    what = settings(config)
     with ui.progress("episodes", config.n_episodes) as advance:
         result = evaluate(
             config.run,
-            settings,
+            what,
             score=config.score,
             device=config.device,
             n_workers=config.n_workers,
             on_progress=advance,
         )
-    folder = evaluation_folder(config.run, settings)
+    folder = evaluation_folder(config.run, what)
     seconds = time.monotonic() - started
     videos = {}
     if config.videos:
@@ -66,5 +70,16 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "result": str(folder / "result.json"),
         "videos": videos,
         "seconds": round(seconds, 2),
-        "next": f"zest report {config.run}",
+        "next": f"zest report {shlex.quote(str(config.run))}",
     }
+
+
+def settings(config: Config) -> EvaluationConfig:
+    """Return what is to be run.
+
+    Raises:
+        BadInput: a value is out of range.
+    """
+    from zest_rl.evaluation import EvaluationConfig
+
+    return EvaluationConfig(config.n_episodes, config.seed, config.rtg, config.target_quantile)

@@ -179,8 +179,12 @@ def _refuse(problems: Sequence[str], source: str) -> None:
 def _convert(value: object, kind: Any) -> Any:
     """Convert a TOML value to the annotation `kind`; TypeError when it does not fit."""
     origin, args = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return value
     if origin is Annotated:
         return _convert(value, args[0])
+    if origin is dict and isinstance(value, dict):
+        return {key: _convert(item, args[1]) for key, item in value.items()}
     if origin in (Union, types.UnionType):
         for option in args:
             try:
@@ -209,6 +213,8 @@ def _describe(kind: Any) -> str:
         return _describe(args[0])
     if origin in (Union, types.UnionType):
         return " or ".join(_describe(option) for option in args if option is not type(None))
+    if origin is dict:
+        return "a table" if args[1] is Any else "a table of tables"
     if origin is Literal:
         return "one of " + ", ".join(repr(choice) for choice in args)
     if origin is list or (origin is tuple and args[-1] is Ellipsis):

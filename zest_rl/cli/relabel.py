@@ -14,7 +14,7 @@ from zest_rl.cli.ui import Ui
 class Config:
     """Relabel a dataset: rewards become the similarity of the change in its frames to the change in the goal."""
 
-    dataset: Annotated[str, tyro.conf.Positional]
+    dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
     """Minari dataset with recorded simulator state."""
     goal: str = "same-scene"
     """Folder with init/ and goal/ pictures, "drawings", "same-scene", or "text:closed microwave -> open microwave"."""
@@ -33,7 +33,7 @@ class Config:
     tolerance: float = 1e-3
     """States that agree to this many rad or m are rendered and embedded once; 0: only equal states."""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
-    """Of the embedder; auto is bf16 where the hardware has it."""
+    """Of the embedder; auto: bf16 where the hardware has it, fp32 for the default embedder."""
     device: str = "auto"
     """auto, cpu, cuda, cuda:1, …"""
     n_workers: int | None = None

@@ -18,20 +18,23 @@ Cells run side by side, one core each; a finished cell is never run again.
 
 from __future__ import annotations
 
+import math
+import re
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from zest_rl.cli.ui import SilentUi, Ui
 from zest_rl.errors import BadInput, nearest
 
-KEYS = ("title", "seeds", "caveats", "paper_demo", "collect", "relabel", "goals", "train", "methods", "evaluate")
-METHOD_KEYS = ("agent", "goal", "kind", "note", "paper")
+if TYPE_CHECKING:
+    from zest_rl.evaluation import EvaluationConfig
+
 POLL_SECONDS = 2.0
 
 
@@ -39,12 +42,60 @@ POLL_SECONDS = 2.0
 class Config:
     """Reproduce a whole comparison from a recipe; rerun the same command to go on or to find everything done."""
 
-    file: Annotated[Path, tyro.conf.Positional]
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECIPE.toml")]
     """Recipe, e.g. eval/demo.toml."""
     output: Path | None = None
     """Folder of runs, result.json and report.html; default runs/RECIPE."""
     n_workers: int | None = None
     """Cells side by side; default one per core."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The keys and tables of a recipe; what stands in a table is checked by the config of its verb."""
+
+    title: str
+    collect: dict[str, Any]
+    methods: dict[str, dict[str, Any]]
+    seeds: tuple[int, ...] = (0,)
+    caveats: tuple[str, ...] = ()
+    paper_demo: float | None = None
+    relabel: dict[str, Any] = field(default_factory=dict)
+    goals: dict[str, dict[str, Any]] = field(default_factory=dict)
+    train: dict[str, Any] = field(default_factory=dict)
+    evaluate: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.methods:
+            raise BadInput("methods needs at least 1 method")
+        if not self.seeds or min(self.seeds) < 0 or len(set(self.seeds)) < len(self.seeds):
+            raise BadInput(f"seeds must be at least 1 number, all different and none negative, got {list(self.seeds)}")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What the table of a method says besides the agent's own flags."""
+
+    agent: str
+    goal: str | None = None
+    kind: Literal["method", "control"] = "method"
+    note: str = ""
+    paper: float | None = None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A recipe, read and checked as a whole before anything runs."""
+
+    recipe: Recipe
+    collect: Any
+    """Config of `zest collect`."""
+    goals: Mapping[str, Any]
+    """Name → config of `zest relabel`."""
+    methods: Mapping[str, Entry]
+    training: Mapping[str, Mapping[str, Any]]
+    """Method → arguments of `zest train AGENT`; dataset and seed are added per cell."""
+    evaluation: EvaluationConfig
 
 
 @dataclass(frozen=True)
@@ -58,22 +109,6 @@ class Cell:
     """Arguments of `zest train AGENT`."""
     evaluate: Mapping[str, Any]
     """Arguments of `zest evaluate`."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """A recipe, read and checked as a whole before anything runs."""
-
-    title: str
-    seeds: tuple[int, ...]
-    caveats: tuple[str, ...]
-    paper_demo: float | None
-    collect: Any
-    goals: Mapping[str, Any]
-    """Name → config of `zest relabel`."""
-    methods: Mapping[str, Mapping[str, Any]]
-    train: Mapping[str, Any]
-    evaluate: Mapping[str, Any]
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
@@ -96,26 +131,21 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         datasets[name] = relabeled["dataset"]
     cells = plan_cells(plan, source, datasets, output)
     ui.say(f"[3/4] train and evaluate {len(cells)} cells in {output / 'cells'}")
-    n_run = run_cells(cells, output, ui, n_workers=config.n_workers)
+    n_run = run_cells(cells, plan.evaluation, output, ui, n_workers=config.n_workers)
     ui.say("[4/4] report")
     methods = [
-        Method(
-            name,
-            tuple(cell.run for cell in cells if cell.method == name),
-            entry.get("kind", "method"),
-            entry.get("note", ""),
-            entry.get("paper"),
-        )
+        Method(name, tuple(cell.run for cell in cells if cell.method == name), entry.kind, entry.note, entry.paper)
         for name, entry in plan.methods.items()
     ]
     report = compare(
-        plan.title,
+        plan.recipe.title,
         methods,
         source_id=source,
         goals=datasets,
-        paper_demo=plan.paper_demo,
-        caveats=plan.caveats,
-        details={"recipe": {"file": config.file.name, **_readable(plan)}, "collected": collected},
+        config=plan.evaluation,
+        paper_demo=plan.recipe.paper_demo,
+        caveats=plan.recipe.caveats,
+        details={"recipe": {"file": config.file.name, **asdict(plan.recipe)}, "collected": collected},
     )
     html = write_report(report, output / "report.html")
     result = {
@@ -133,12 +163,13 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
             for row in report.table
         },
         "spearman_of_zest_and_true_returns": {
-            scatter.name: {"value": scatter.spearman, "ci95": scatter.ci} for scatter in report.scatters
+            scatter.name: None if math.isnan(scatter.spearman) else {"value": scatter.spearman, "ci95": scatter.ci}
+            for scatter in report.scatters
         },
         "dataset": {
             key: collected[key] for key in ("dataset", "n_episodes", "n_failed", "noise_max", "expert_success")
         },
-        "seeds": list(plan.seeds),
+        "seeds": list(plan.recipe.seeds),
         "seconds_by_cell": {cell.run.name: _seconds(cell) for cell in cells},
         "provenance": artifacts.provenance(),
     }
@@ -168,7 +199,8 @@ def summary(result: Mapping[str, Any]) -> str:
             f"{row['n_seeds']:>7}{row['n_episodes']:>10}{paper:>8}"
         )
     for name, rho in result["spearman_of_zest_and_true_returns"].items():
-        lines.append(f"goal {name}: Spearman ρ of ZeST and true returns {rho['value']:.3f}")
+        value = "undefined" if rho is None else f"{rho['value']:.3f}"
+        lines.append(f"goal {name}: Spearman ρ of ZeST and true returns {value}")
     return "\n".join(
         [*lines, f"report: {result['report']}", f"{result['n_cells_run']} cells run, {result['seconds']} s"]
     )
@@ -184,78 +216,70 @@ def read_plan(path: Path) -> Plan:
     from zest_rl.cli import collect, evaluate, relabel, train
     from zest_rl.cli.recipes import load_config, read_recipe
 
-    recipe = read_recipe(path)
-    unknown = [f"unknown table or key {key!r}; {nearest(key, KEYS)}" for key in recipe if key not in KEYS]
-    missing = [f"{key!r} is required" for key in ("title", "collect", "methods") if key not in recipe]
-    if unknown or missing:
-        raise BadInput(f"recipe {path}: " + "; ".join([*unknown, *missing]))
-    goals = {
-        name: load_config(
-            relabel.Config, {"dataset": "", **recipe.get("relabel", {}), **goal}, f"{path} [goals.{name}]"
-        )
-        for name, goal in recipe.get("goals", {}).items()
-    }
-    seeds = tuple(recipe.get("seeds", [0]))
-    for name, method in recipe["methods"].items():
-        where = f"{path} [methods.{name!r}]"
-        if "agent" not in method:
-            raise BadInput(f'{where}: agent is required, e.g. agent = "dt"')
-        get_agent(method["agent"])
-        if method.get("goal") is not None and method["goal"] not in goals:
-            raise BadInput(f"{where}: unknown goal {method['goal']!r}; {nearest(method['goal'], goals)}")
-        load_config(train.CONFIGS[method["agent"]], _train_table(recipe.get("train", {}), method, "", 0), where)
-    load_config(evaluate.Config, {"run": "", **recipe.get("evaluate", {})}, f"{path} [evaluate]")
+    recipe = load_config(Recipe, read_recipe(path), f"recipe {path}")
+    goals = {}
+    for name, goal in recipe.goals.items():
+        where = f"recipe {path} [goals.{name!r}]"
+        table = {**_table(recipe.relabel, where, "dataset"), **_table(goal, where, "dataset"), "dataset": ""}
+        goals[name] = load_config(relabel.Config, table, where)
+    methods, training = {}, {}
+    for name, method in recipe.methods.items():
+        where = f"recipe {path} [methods.{name!r}]"
+        own = {key: value for key, value in method.items() if key in (f.name for f in fields(Entry))}
+        flags = {key: value for key, value in method.items() if key not in own}
+        methods[name] = entry = load_config(Entry, own, where)
+        get_agent(entry.agent)
+        if entry.goal is not None and entry.goal not in goals:
+            raise BadInput(f"{where}: unknown goal {entry.goal!r}; {nearest(entry.goal, goals)}")
+        training[name] = {
+            "n_updates": 5000,
+            "threads": 1,
+            "device": "cpu",
+            **_table(recipe.train, where, "dataset", "seed", "run_dir"),
+            **_table(flags, where, "dataset", "seed", "run_dir"),
+        }
+        load_config(train.CONFIGS[entry.agent], {**training[name], "dataset": ""}, where)
+    where = f"recipe {path} [evaluate]"
+    evaluation = load_config(evaluate.Config, {**_table(recipe.evaluate, where, "run"), "run": ""}, where)
     return Plan(
-        title=recipe["title"],
-        seeds=seeds,
-        caveats=tuple(recipe.get("caveats", [])),
-        paper_demo=recipe.get("paper_demo"),
-        collect=load_config(collect.Config, recipe["collect"], f"{path} [collect]"),
+        recipe=recipe,
+        collect=load_config(collect.Config, recipe.collect, f"recipe {path} [collect]"),
         goals=goals,
-        methods=recipe["methods"],
-        train=recipe.get("train", {}),
-        evaluate=recipe.get("evaluate", {}),
+        methods=methods,
+        training=training,
+        evaluation=evaluate.settings(evaluation),
     )
 
 
-def _train_table(shared: Mapping[str, Any], method: Mapping[str, Any], dataset: str, seed: int) -> dict[str, Any]:
-    own = {key: value for key, value in method.items() if key not in METHOD_KEYS}
-    return {"n_updates": 5000, "threads": 1, "device": "cpu", **shared, **own, "dataset": dataset, "seed": seed}
-
-
-def _readable(plan: Plan) -> dict[str, Any]:
-    return {
-        "collect": vars(plan.collect),
-        "goals": {name: vars(goal) for name, goal in plan.goals.items()},
-        "train": dict(plan.train),
-        "methods": {name: dict(method) for name, method in plan.methods.items()},
-        "evaluate": dict(plan.evaluate),
-        "seeds": list(plan.seeds),
-    }
+def _table(values: Mapping[str, Any], where: str, *given: str) -> dict[str, Any]:
+    """Return a table with ``_`` for ``-`` in its keys; refuse those that `zest reproduce` itself gives."""
+    table = {key.replace("-", "_"): value for key, value in values.items()}
+    clash = sorted(table.keys() & set(given))
+    if clash:
+        raise BadInput(f"{where}: {', '.join(map(repr, clash))} is not for a recipe to set, it follows from the rest")
+    return table
 
 
 def plan_cells(plan: Plan, source: str, datasets: Mapping[str, str], output: Path) -> list[Cell]:
     """Return one cell per method and seed; a cell's folder is named by a hash of all that it depends on."""
-    import re
-
     from zest_rl import artifacts, data
 
     described = {dataset: data.describe(dataset) for dataset in {source, *datasets.values()}}
     cells = []
-    for name, method in plan.methods.items():
-        dataset = source if method.get("goal") is None else datasets[method["goal"]]
-        for seed in plan.seeds:
-            table = _train_table(plan.train, method, dataset, seed)
-            identity = [table, method["agent"], dict(plan.evaluate), described[dataset]]
+    for name, entry in plan.methods.items():
+        dataset = source if entry.goal is None else datasets[entry.goal]
+        for seed in plan.recipe.seeds:
+            table = {**plan.training[name], "dataset": dataset, "seed": seed}
+            identity = [table, entry.agent, plan.recipe.evaluate, described[dataset]]
             slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
             folder = output / "cells" / f"{slug}-seed{seed}-{artifacts.hash_json(identity)[:8]}"
             cells.append(
                 Cell(
                     name,
                     folder,
-                    method["agent"],
+                    entry.agent,
                     {**table, "run_dir": str(folder)},
-                    {"n_workers": 1, **plan.evaluate, "run": str(folder)},
+                    {"n_workers": 1, **plan.recipe.evaluate, "run": str(folder)},
                 )
             )
     return cells
@@ -274,12 +298,14 @@ def _work(cell: Cell) -> dict[str, Any]:
     return {"train_seconds": np.array(trained - started), "evaluate_seconds": np.array(time.monotonic() - trained)}
 
 
-def run_cells(cells: list[Cell], output: Path, ui: Ui, *, n_workers: int | None = None) -> int:
+def run_cells(
+    cells: list[Cell], evaluation: EvaluationConfig, output: Path, ui: Ui, *, n_workers: int | None = None
+) -> int:
     """Train and evaluate all cells that are not done; return how many were not."""
     from zest_rl.parallel import map_jobs
 
     done_folder = output / "done"
-    open_cells = {cell.run.name: cell for cell in cells if not _is_done(cell, done_folder)}
+    open_cells = {cell.run.name: cell for cell in cells if not _is_done(cell, evaluation, done_folder)}
     total = sum(cell.train["n_updates"] for cell in open_cells.values())
     with (
         ui.progress("updates of all cells (evaluation follows)", total) as advance,
@@ -289,10 +315,14 @@ def run_cells(cells: list[Cell], output: Path, ui: Ui, *, n_workers: int | None 
     return len(open_cells)
 
 
-def _is_done(cell: Cell, folder: Path) -> bool:
+def _is_done(cell: Cell, evaluation: EvaluationConfig, folder: Path) -> bool:
+    """Whether a cell's results are there; a marker without them is removed, so that the cell is run again."""
+    from zest_rl.evaluation import evaluation_folder
+
     marker = folder / f"{cell.run.name}.npz"
-    if marker.exists() and not (cell.run / "meta.json").exists():
-        marker.unlink()  # its folder was deleted: the cell is to be run again
+    results = (cell.run / "meta.json", evaluation_folder(cell.run, evaluation) / "result.json")
+    if not all(path.exists() for path in results):
+        marker.unlink(missing_ok=True)
     return marker.exists()
 
 

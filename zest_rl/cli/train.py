@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -16,7 +17,7 @@ class Arguments:
     """What every agent's training needs; the agent's own fields are flags beside these."""
 
     agent: ClassVar[str]
-    dataset: Annotated[str, tyro.conf.Positional]
+    dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
     """Minari dataset; its rewards are the output of `zest relabel`, or the ground truth of `zest collect`."""
     run_dir: Path | None = None
     """Folder of this run; default runs/DATASET-AGENT-seedN."""
@@ -63,7 +64,7 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
         "n_params": meta["n_params"],
         "n_updates": meta["n_updates"],
         "train_seconds": meta["train_seconds"],
-        "next": f"zest evaluate {run_dir}",
+        "next": f"zest evaluate {shlex.quote(str(run_dir))}",
     }
 
 

@@ -1,0 +1,56 @@
+"""Videos for people: right length, playable everywhere, and showing what happened."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+
+from zest_rl import data
+from zest_rl.rendering import RenderConfig, StateRenderer
+from zest_rl.videos import FPS, SCENE, representative, write_video
+
+N_FRAMES = 8
+
+
+@pytest.fixture
+def states(collected: str) -> np.ndarray:
+    """Every twelfth state of an episode in which the microwave opens."""
+    return data.read_states(collected)[0][::12][:N_FRAMES]
+
+
+def test_a_video_is_h264_with_one_frame_per_state_and_shows_the_states(states: np.ndarray, tmp_path: Path) -> None:
+    path = write_video(states, tmp_path / "videos" / "best.mp4", size=160)
+    with imageio.get_reader(path) as reader:
+        meta, frames = reader.get_meta_data(), np.stack([np.asarray(frame) for frame in reader.iter_data()])
+    assert meta["codec"] == "h264"
+    assert meta["fps"] == FPS == 12.5
+    assert frames.shape == (N_FRAMES, 160, 160, 3)
+    with StateRenderer(RenderConfig(size=160, robot=True), (SCENE,)) as renderer:
+        rendered = np.stack([renderer.render(state)[0] for state in states])
+    error = [[np.abs(shown - true.astype(float)).mean() for true in rendered] for shown in frames.astype(float)]
+    np.testing.assert_array_equal(np.argmin(error, axis=1), np.arange(N_FRAMES))  # each frame is of its own state
+    assert np.diag(error).max() < 6
+    assert [file.name for file in path.parent.iterdir()] == ["best.mp4"], "nothing else is left behind"
+
+
+def test_a_video_can_be_written_over_an_old_one(states: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"not a video")
+    write_video(states[:2], path, size=64)
+    assert imageio.mimread(path)[0].shape == (64, 64, 3)
+
+
+@pytest.mark.parametrize(
+    ("returns", "expected"),
+    [
+        ([3.0, 9.0, 1.0, 5.0, 4.0], {"best": 1, "median": 4, "worst": 2}),
+        ([2.0, 7.0, 7.0, 2.0], {"best": 1, "median": 0, "worst": 3}),
+        ([1.0, 2.0], {"best": 1, "median": 0, "worst": 0}),
+        ([5.0], {"best": 0, "median": 0, "worst": 0}),
+    ],
+)
+def test_best_median_and_worst_are_ranks_of_the_return(returns: list[float], expected: dict[str, int]) -> None:
+    assert representative(np.array(returns)) == expected
