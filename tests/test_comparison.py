@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from conftest import COLLECTED
+
 from zest_rl import comparison, data, metrics
 from zest_rl.comparison import (
     Method,

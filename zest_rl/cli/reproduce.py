@@ -22,7 +22,8 @@ import math
 import re
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -228,7 +229,8 @@ def read_plan(path: Path) -> Plan:
         own = {key: value for key, value in method.items() if key in (f.name for f in fields(Entry))}
         flags = {key: value for key, value in method.items() if key not in own}
         methods[name] = entry = load_config(Entry, own, where)
-        get_agent(entry.agent)
+        with _at(where):
+            get_agent(entry.agent)
         if entry.goal is not None and entry.goal not in goals:
             raise BadInput(f"{where}: unknown goal {entry.goal!r}; {nearest(entry.goal, goals)}")
         training[name] = {
@@ -240,15 +242,26 @@ def read_plan(path: Path) -> Plan:
         }
         load_config(train.CONFIGS[entry.agent], {**training[name], "dataset": ""}, where)
     where = f"recipe {path} [evaluate]"
-    evaluation = load_config(evaluate.Config, {**_table(recipe.evaluate, where, "run"), "run": ""}, where)
+    evaluate_config = load_config(evaluate.Config, {**_table(recipe.evaluate, where, "run"), "run": ""}, where)
+    with _at(where):
+        evaluation = evaluate.settings(evaluate_config)
     return Plan(
         recipe=recipe,
         collect=load_config(collect.Config, recipe.collect, f"recipe {path} [collect]"),
         goals=goals,
         methods=methods,
         training=training,
-        evaluation=evaluate.settings(evaluation),
+        evaluation=evaluation,
     )
+
+
+@contextmanager
+def _at(where: str) -> Iterator[None]:
+    """Say in a refusal which part of the recipe it is about."""
+    try:
+        yield
+    except BadInput as error:
+        raise BadInput(f"{where}: {error}") from error
 
 
 def _table(values: Mapping[str, Any], where: str, *given: str) -> dict[str, Any]:

@@ -1,0 +1,187 @@
+"""From recorded states to rewards: `zest_rl.relabel` against the loop that one would write, and scoring once more.
+
+The plain loop renders each frame with ``env.render()`` of gymnasium-robotics' FrankaKitchen-v1 and embeds it on its own
+through timm in fp32, one view; it is timed on a few frames. Ours is the whole of `relabel` on an empty cache, 8 views:
+goal, rendering, embedding, scoring, writing. Both are counted per frame and view of the dataset, on one torch thread,
+in processor time of this process and its children; imports are left out.
+
+Scoring again asks how long another goal or formula takes once the states are embedded: 60 episodes, 6,060 frames, 8
+views. The episodes are rolled out; the vectors in the cache are those of the first part, handed out in turn, because
+their values have no influence on the time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl import artifacts, collect, data
+from zest_rl.data_writer import write_dataset
+from zest_rl.embed import STATES_PER_SHARD
+from zest_rl.frames import Views, canonical_states
+from zest_rl.parallel import chunks, concatenate, one_thread, write_arrays
+from zest_rl.relabel import relabel
+from zest_rl.rendering import select_gl_backend
+from zest_rl.scorer import Scorer, ScorerConfig
+
+REQUIRED_RATIO = 25.0
+REQUIRED_RESCORING_S = 2.0
+N_PLAIN_FRAMES = 5
+N_ROUNDS = 3
+N_RELABELED, N_RESCORED = 4, 60
+DATASET = "zest/kitchen-micro-benchmark-v0"
+CONFIG = ScorerConfig(Views("micro", n_views=8), goal="same-scene")
+OTHERS = {
+    "goal": replace(CONFIG, goal="drawings"),
+    "features": replace(CONFIG, features="raw"),
+    "similarity": replace(CONFIG, similarity="l2"),
+}
+
+
+def cpu_seconds() -> float:
+    """Return the processor time of this process and of its children that have ended."""
+    return sum(os.times()[:4])
+
+
+def plain_ms() -> float:
+    """Return cpu-ms per frame of the plain loop."""
+    # not at the top: the process in which a dataset is written imports this file
+    import gymnasium
+    import gymnasium_robotics
+    import torch
+    from PIL import Image
+    from timm.data.transforms_factory import create_transform
+
+    from zest_rl.embedders.checkpoints import LITE0_PREPROCESSING, installed_weights
+    from zest_rl.embedders.networks import build_lite0
+
+    select_gl_backend()
+    gymnasium.register_envs(gymnasium_robotics)
+    env = gymnasium.make("FrankaKitchen-v1", render_mode="rgb_array", width=224, height=224, disable_env_checker=True)
+    network, transform = build_lite0(installed_weights()).module, create_transform(**LITE0_PREPROCESSING)
+
+    @torch.inference_mode()
+    def embed_frame() -> NDArray[np.float32]:
+        frame: Any = env.render()
+        return np.asarray(network(transform(Image.fromarray(frame))[None]).numpy())
+
+    env.reset(seed=0)
+    embed_frame()  # the first frame pays for the GL context
+    seconds = 0.0
+    for _ in range(N_PLAIN_FRAMES):
+        env.step(env.action_space.sample())
+        start = cpu_seconds()
+        embed_frame()
+        seconds += cpu_seconds() - start
+    env.close()
+    return 1e3 * seconds / N_PLAIN_FRAMES
+
+
+def relabel_ms(episodes: dict[str, NDArray[Any]]) -> tuple[Scorer, float, float]:
+    """Return the scorer, cpu-ms per frame and view, and cpu-ms per *distinct* state and view."""
+    write_dataset(
+        DATASET,
+        collect.recordings(episodes),
+        env_spec=collect.env_spec("micro").to_json(),
+        ref_min_score=0.0,
+        ref_max_score=70.0,
+        algorithm_name="scripted expert with uniform action noise",
+        description="episodes for a benchmark",
+        zest={},
+    )
+    start = cpu_seconds()
+    made = relabel(DATASET, CONFIG, n_workers=1)
+    milliseconds = 1e3 * (cpu_seconds() - start) / CONFIG.views.n_views
+    assert np.ptp([episode.rewards.sum() for episode in data.read_episodes(made.dataset_id)]) > 0
+    return made.scorer, milliseconds / made.n_frames, milliseconds / made.scorer.states.n_embedded
+
+
+def fill_cache(scorer: Scorer, states: NDArray[np.float64], vectors: NDArray[np.float32]) -> int:
+    """Put all of `states` (N, 30) into the scorer's cache with (n, V, D) `vectors` in turn; return how many differ."""
+    distinct = np.unique(canonical_states(states, scorer.config.views), axis=0)
+    for path in scorer.states.folder.glob("*.npz"):
+        path.unlink()
+    for part in chunks(len(distinct), STATES_PER_SHARD):
+        keys = distinct[part.start : part.stop]
+        path = scorer.states.folder / f"{artifacts.hash_arrays(keys)[:20]}.npz"
+        write_arrays(path, {"keys": keys, "embeddings": vectors[np.arange(part.start, part.stop) % len(vectors)]})
+    return len(distinct)
+
+
+def rescoring_seconds(config: ScorerConfig, episodes: list[NDArray[np.float64]]) -> float:
+    """Return cpu-s from a new configuration to the scores of all episodes: goal, reading the cache, scoring.
+
+    The best of N_ROUNDS, as the machine may be busy with other things; the goal is embedded in each.
+    """
+    seconds = []
+    for _ in range(N_ROUNDS):
+        shutil.rmtree(artifacts.cache_dir() / "goals", ignore_errors=True)
+        start = cpu_seconds()
+        scorer = Scorer.build(config, episodes[0][0], n_workers=1)
+        scores, _ = scorer.score_episodes(episodes)
+        seconds.append(cpu_seconds() - start)
+        assert scorer.states.n_embedded == 0
+        assert all(np.isfinite(score).all() for score in scores)
+    return min(seconds)
+
+
+def run() -> dict[str, object]:
+    """Return cpu-ms per frame and view of both loops, cpu-s of scoring again, and whether both requirements are met."""
+    behaviour = collect.Behaviour("micro", "expert", noise_max=1.0)
+    before = {name: os.environ.get(name) for name in ("MINARI_DATASETS_PATH", "ZEST_CACHE")}
+    with tempfile.TemporaryDirectory() as folder, one_thread():
+        os.environ.update(MINARI_DATASETS_PATH=str(Path(folder, "minari")), ZEST_CACHE=str(Path(folder, "cache")))
+        try:
+            plain = plain_ms()
+            episodes = concatenate([collect.rollout(behaviour, index) for index in range(N_RESCORED)])
+            scorer, ours, per_state = relabel_ms({name: array[:N_RELABELED] for name, array in episodes.items()})
+            states = list(episodes["qpos"])
+            vectors, _ = scorer.states.embed(np.concatenate(states[:N_RELABELED]))
+            n_distinct = fill_cache(scorer, np.concatenate(states), vectors)
+            rescoring = {name: rescoring_seconds(config, states) for name, config in OTHERS.items()}
+        finally:
+            for name, value in before.items():
+                os.environ.pop(name) if value is None else os.environ.update({name: value})
+    return {
+        "plain_cpu_ms_per_frame": round(plain, 1),
+        "zest_rl_cpu_ms_per_frame_and_view": round(ours, 2),
+        "zest_rl_cpu_ms_per_distinct_state_and_view": round(per_state, 2),
+        "ratio": round(plain / ours, 1),
+        "ratio_without_sharing_equal_states": round(plain / per_state, 1),
+        "required_ratio": REQUIRED_RATIO,
+        "rescoring_frames": sum(map(len, states)),
+        "rescoring_distinct_states": n_distinct,
+        **{f"rescoring_other_{name}_cpu_s": round(seconds, 2) for name, seconds in rescoring.items()},
+        "required_rescoring_cpu_s": REQUIRED_RESCORING_S,
+        "passed": plain / ours >= REQUIRED_RATIO and max(rescoring.values()) < REQUIRED_RESCORING_S,
+    }
+
+
+def main() -> None:
+    """Print the comparison; exit with 1 when a requirement is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    as_json = parser.parse_args().json
+    start = time.monotonic()
+    result = run() | {"seconds": round(time.monotonic() - start, 1)}
+    if as_json:
+        print(json.dumps(result))
+    else:
+        for name, value in result.items():
+            print(f"{name:44} {value}")
+    sys.exit(0 if result["passed"] else 1)
+
+
+if __name__ == "__main__":
+    main()
