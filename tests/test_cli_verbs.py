@@ -347,6 +347,8 @@ def test_a_deleted_cell_is_run_again_alone_and_to_the_same_numbers(
     assert result["n_cells_run"] == 1
     assert result["rows"] == whole.result["rows"]
     assert (gone / "model.safetensors").read_bytes() == weights
+    traces = [comparison.latest_evaluation(folder).traces for folder in (gone, cell(whole.output, "zest-dt"))]
+    np.testing.assert_array_equal(traces[0]["qpos"], traces[1]["qpos"])
     assert kept.stat().st_mtime_ns == before
 
 
@@ -456,5 +458,7 @@ def test_a_reproduction_killed_in_training_goes_on_and_ends_with_the_same_bits(
     whole = zest("reproduce", recipe, "--output", tmp_path / "whole", "--n-workers", "1")
     assert resumed["rows"] == whole["rows"]
     for method in ("bc", "zest-dt"):
-        one, other = (cell(tmp_path / name, method) / "model.safetensors" for name in ("cut", "whole"))
-        assert one.read_bytes() == other.read_bytes()
+        one, other = (cell(tmp_path / name, method) for name in ("cut", "whole"))
+        assert (one / "model.safetensors").read_bytes() == (other / "model.safetensors").read_bytes()
+        traces = [comparison.latest_evaluation(folder).traces for folder in (one, other)]
+        np.testing.assert_array_equal(traces[0]["qpos"], traces[1]["qpos"])

@@ -44,7 +44,8 @@ class EmbedConfig:
 
 
 @functools.cache
-def _renderer(views: Views) -> StateRenderer:
+def shared_renderer(views: Views) -> StateRenderer:
+    """Return this process's renderer of `views`, open until the process ends: to build one takes half a second."""
     renderer = views.renderer()
     atexit.register(renderer.close)  # left open, or closed after the GL library, it complains when the process ends
     return renderer
@@ -57,7 +58,7 @@ def _embedder(uri: str, precision: Precision, device: str) -> Embedder:
 
 def _embed_states(job: tuple[EmbedConfig, NDArray[np.float64]]) -> dict[str, NDArray[np.generic]]:
     config, states = job
-    renderer, embedder = _renderer(config.views), config.load_embedder()
+    renderer, embedder = shared_renderer(config.views), config.load_embedder()
     with one_thread():
         embeddings = [embedder.embed_images(list(renderer.render(state))) for state in states]
     return {"keys": states, "embeddings": np.stack(embeddings)}
