@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from zest_rl import artifacts
 from zest_rl.data_writer import Recording
-from zest_rl.envs import ENV_ID, HORIZON
+from zest_rl.envs import ACT_DIM, ENV_ID, HORIZON
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.experts import add_uniform_noise, make_expert
 from zest_rl.parallel import chunks, concatenate, map_jobs, read_arrays
+from zest_rl.types import FloatArray
 
 EPISODES_PER_JOB = 5
 REFERENCE_STREAM = 2**31
@@ -71,21 +72,21 @@ def rollout(behaviour: Behaviour, index: int) -> Arrays:
     level = rng.uniform() * behaviour.noise_max
     env = gymnasium.make(env_spec(behaviour.task, behaviour.init_noise))
     expert = make_expert(behaviour.task, env)
-    obs, info = env.reset(seed=int(env_seed))
-    steps: dict[str, list[Any]] = {
-        "obs": [obs], "actions": [], "qpos": [info["state"]["qpos"]], "qvel": [info["state"]["qvel"]],
-        "gt_reward": [info["gt"]["reward"]], "gt_success": [info["gt"]["success"]],
-    }  # fmt: skip
-    for _ in range(HORIZON):
-        action = expert.act() if behaviour.policy == "expert" else np.zeros(env.action_space.shape or (), np.float32)
-        action = add_uniform_noise(action, level, rng)
-        obs, _, _, _, info = env.step(action)
+    steps: dict[str, list[Any]] = {name: [] for name in ("obs", "actions", "qpos", "qvel", "gt_reward", "gt_success")}
+
+    def record(obs: FloatArray, info: dict[str, Any]) -> None:
         steps["obs"].append(obs)
-        steps["actions"].append(action)
         steps["qpos"].append(info["state"]["qpos"])
         steps["qvel"].append(info["state"]["qvel"])
         steps["gt_reward"].append(info["gt"]["reward"])
         steps["gt_success"].append(info["gt"]["success"])
+
+    record(*env.reset(seed=int(env_seed)))
+    for _ in range(HORIZON):
+        action = expert.act() if behaviour.policy == "expert" else np.zeros(ACT_DIM, np.float32)
+        steps["actions"].append(add_uniform_noise(action, level, rng))
+        obs, _, _, _, info = env.step(steps["actions"][-1])
+        record(obs, info)
     env.close()
     episode = {name: np.stack(values)[None] for name, values in steps.items()}
     return {**episode, "seed": np.array([env_seed], dtype=np.int64), "level": np.array([level])}
