@@ -16,7 +16,8 @@ PACKAGE = Path(zest_rl.__file__).parent
 ROOT = PACKAGE.parent
 
 ORDER = (
-    "errors", "types", "artifacts", "parallel", "tasks", "data", "data_writer", "metrics", "envs", "experts", "collect",
+    "load_order", "errors", "types", "artifacts", "parallel", "tasks", "data", "data_writer", "metrics", "envs",
+    "experts", "collect",
     "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "relabel", "agents",
     "training", "evaluation", "report", "comparison",
     "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.train", "cli.evaluate",

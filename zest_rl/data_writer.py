@@ -99,7 +99,8 @@ def _publish(staging: Path, dataset_id: str, meant: Sequence[Mapping[str, NDArra
                     raise ZestError(f"{name} of episode {i} of {dataset_id} was not written whole; is the disk full?")
         if len(file) != len(meant):
             raise ZestError(f"{len(file)} of {len(meant)} episodes of {dataset_id} were written; try again")
-    digests = {name: artifacts.hash_file(staging / name) for name in (DATA_FILE, METADATA_FILE)}
+    files = [path for path in sorted(staging.rglob("*")) if path.is_file()]
+    digests = {path.relative_to(staging).as_posix(): artifacts.hash_file(path) for path in files}
     artifacts.write_json(staging / MANIFEST_FILE, digests)
 
 

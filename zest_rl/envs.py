@@ -19,6 +19,7 @@ from functools import cache
 from io import StringIO
 from typing import Any
 
+import zest_rl.load_order  # noqa: F401  # isort: skip
 import gymnasium
 import mujoco
 import numpy as np

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import zest_rl.load_order  # noqa: F401  # isort: skip
 import gymnasium
 import mujoco
 import numpy as np

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl import artifacts
-from zest_rl.errors import ZestError
+from zest_rl.errors import BadInput, ZestError
 
 Job = TypeVar("Job")
 Arrays = Mapping[str, NDArray[Any]]
@@ -111,8 +111,11 @@ def map_jobs(
         on_done: called with the name of each job when its file is there, also for those found finished.
 
     Raises:
+        BadInput: `n_workers` is below 1.
         ZestError: a worker process died (out of memory, killed). What was finished is kept.
     """
+    if n_workers is not None and n_workers < 1:
+        raise BadInput(f"the number of workers must be at least 1, got {n_workers}; leave it out for one per core")
     missing = []
     for name in jobs:
         if read_arrays(folder / f"{name}.npz") is None:

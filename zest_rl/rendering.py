@@ -21,6 +21,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import zest_rl.load_order  # noqa: F401  # isort: skip
 import fast_simplification
 import mujoco
 import numpy as np
@@ -294,10 +295,6 @@ def gl_backend() -> str:
 def _open_gl(model: mujoco.MjModel, size: int) -> tuple[Any, mujoco.MjrContext]:
     """Return a GL context, current in this thread, and MuJoCo's drawing context in it."""
     backend = select_gl_backend()
-    if importlib.util.find_spec("triton"):
-        # GL's software driver and Triton each bring an LLVM; loaded in the other order, Python crashes (seen with
-        # Mesa 22.3 and Triton 3, which torch, timm and transformers load). Costs 0.4 s once.
-        importlib.import_module("triton")
     try:
         module = f"mujoco.{backend}" if backend in ("egl", "osmesa") else "mujoco.gl_context"
         gl = importlib.import_module(module).GLContext(size, size)
