@@ -30,7 +30,7 @@ lint: setup ## ruff and mypy
 	.venv/bin/mypy
 
 bench: setup ## compare speeds with other implementations
-	@set -e; for file in benchmarks/*.py; do echo "== $$file"; .venv/bin/python "$$file"; done
+	.venv/bin/python -m benchmarks
 
 clean: ## remove caches and builds; keeps .venv, runs and datasets
 	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist

@@ -4,16 +4,11 @@ Both train `transformers.DecisionTransformerModel` of the default size on the sa
 loop is what the documentation of transformers leads to: float32, eager attention, nn.Dropout, default AdamW. The two
 take turns, update by update, so that other load on the machine meets both; CPU time is measured, and the medians
 compared. Acting is timed as well: one call for 25 episodes with a full context.
-
-Run: ``python benchmarks/dt_training.py [--json] [--updates N]``
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import statistics
-import sys
 import time
 from collections.abc import Callable
 
@@ -29,7 +24,8 @@ from zest_rl.types import Episode
 OBS_DIM, ACT_DIM, N_STEPS, N_EPISODES = 59, 9, 100, 100  # as the kitchen's datasets
 N_ACTING = 25
 CPU = torch.device("cpu")
-WARM_UP = 3
+WARM_UP, N_UPDATES = 3, 20
+REQUIRED_RATIO = 2.0
 
 
 def random_episodes() -> list[Episode]:
@@ -107,7 +103,7 @@ def time_acting(model: nn.Module, facts: DataFacts, precision: Precision) -> flo
     return 1e3 * statistics.median(times[config.context_len :])
 
 
-def run(n_updates: int = 20) -> dict[str, float | str]:
+def run() -> dict[str, object]:
     """Return updates per CPU second of both loops, their ratio, and the CPU milliseconds of acting."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -118,7 +114,7 @@ def run(n_updates: int = 20) -> dict[str, float | str]:
         model, ours = our_update(facts)
         contestants = {"plain": plain_update(), "zest_rl": ours}
         times: dict[str, list[float]] = {name: [] for name in contestants}
-        for _ in range(WARM_UP + n_updates):
+        for _ in range(WARM_UP + N_UPDATES):
             batch = sample(rng)
             for name, update in contestants.items():
                 start = time.process_time()
@@ -127,30 +123,13 @@ def run(n_updates: int = 20) -> dict[str, float | str]:
         plain, zest = (statistics.median(times[name][WARM_UP:]) for name in contestants)
         return {
             "precision": resolve_precision("auto", CPU),
-            "plain_updates_per_s": 1 / plain,
-            "zest_rl_updates_per_s": 1 / zest,
-            "speedup": plain / zest,
-            "act_ms": time_acting(model, facts, resolve_precision("auto", CPU)),
-            "act_fp32_ms": time_acting(model, facts, "fp32"),
+            "plain_updates_per_s": round(1 / plain, 2),
+            "zest_rl_updates_per_s": round(1 / zest, 2),
+            "act_ms": round(time_acting(model, facts, resolve_precision("auto", CPU)), 1),
+            "act_fp32_ms": round(time_acting(model, facts, "fp32"), 1),
+            "ratio": round(plain / zest, 2),
+            "required_ratio": REQUIRED_RATIO,
+            "passed": plain / zest >= REQUIRED_RATIO,
         }
     finally:
         torch.set_num_threads(threads)
-
-
-def main() -> None:
-    """Print the result."""
-    parser = argparse.ArgumentParser(description="Decision Transformer: updates per second on one thread")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--updates", type=int, default=20, help="timed updates per loop")
-    arguments = parser.parse_args()
-    result = run(arguments.updates)
-    if arguments.json:
-        json.dump(result, sys.stdout, indent=2)
-        print()
-        return
-    for name, value in result.items():
-        print(f"{name:24}{value if isinstance(value, str) else f'{value:.2f}'}")
-
-
-if __name__ == "__main__":
-    main()

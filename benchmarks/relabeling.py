@@ -12,13 +12,9 @@ their values have no influence on the time.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import shutil
-import sys
 import tempfile
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -166,22 +162,3 @@ def run() -> dict[str, object]:
         "required_rescoring_cpu_s": REQUIRED_RESCORING_S,
         "passed": plain / ours >= REQUIRED_RATIO and max(rescoring.values()) < REQUIRED_RESCORING_S,
     }
-
-
-def main() -> None:
-    """Print the comparison; exit with 1 when a requirement is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    as_json = parser.parse_args().json
-    start = time.monotonic()
-    result = run() | {"seconds": round(time.monotonic() - start, 1)}
-    if as_json:
-        print(json.dumps(result))
-    else:
-        for name, value in result.items():
-            print(f"{name:44} {value}")
-    sys.exit(0 if result["passed"] else 1)
-
-
-if __name__ == "__main__":
-    main()

@@ -6,9 +6,6 @@ threads of the process, because software GL may spread a frame over several core
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import time
 
 import gymnasium
@@ -73,21 +70,3 @@ def run() -> dict[str, object]:
         "required_ratio": REQUIRED_RATIO,
         "passed": peer / hidden >= REQUIRED_RATIO,
     }
-
-
-def main() -> None:
-    """Print the comparison; exit with 1 when the required ratio is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    as_json = parser.parse_args().json
-    result = run()
-    if as_json:
-        print(json.dumps(result))
-    else:
-        for name, value in result.items():
-            print(f"{name:20} {value}")
-    sys.exit(0 if result["passed"] else 1)
-
-
-if __name__ == "__main__":
-    main()

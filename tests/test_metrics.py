@@ -52,24 +52,37 @@ def test_the_interval_is_wider_when_trainings_differ_than_their_pooled_episodes_
     assert by_seed.high - by_seed.low > 2.5 * (pooled.high - pooled.low)
 
 
-def test_groups_of_any_size_are_resampled_whole() -> None:
-    constant = [np.array([1.0]), np.array([2.0, 2.0, 2.0])]
-    estimate = bootstrap(constant, n_resamples=500)
-    assert (estimate.value, estimate.low, estimate.high) == (1.75, 1.0, 2.0)
+def test_seeds_are_resampled_whole_and_within_their_task_alone() -> None:
+    seeds = [np.full(3, 1.0), np.full(3, 2.0)]
+    estimate = bootstrap(seeds, n_resamples=500)
+    assert (estimate.value, estimate.low, estimate.high) == (1.5, 1.0, 2.0)
+    of_two_tasks = bootstrap(seeds[:1], seeds[1:], n_resamples=500)
+    assert (of_two_tasks.value, of_two_tasks.low, of_two_tasks.high) == (1.5, 1.5, 1.5)
 
 
 def test_a_bootstrap_repeats_with_its_seed_and_takes_any_statistic() -> None:
     values = [np.random.default_rng(3).normal(size=30)]
-    first = bootstrap(values, iqm, seed=5, n_resamples=200)
-    assert first == bootstrap(values, iqm, seed=5, n_resamples=200)
-    assert first != bootstrap(values, iqm, seed=6, n_resamples=200)
+    first = bootstrap(values, statistic=iqm, seed=5, n_resamples=200)
+    assert first == bootstrap(values, statistic=iqm, seed=5, n_resamples=200)
+    assert first != bootstrap(values, statistic=iqm, seed=6, n_resamples=200)
     assert first.value == iqm(values[0]) != mean(values[0])
 
 
-@pytest.mark.parametrize("groups", [[], [np.array([])], [np.ones(3), np.array([])]])
-def test_an_interval_of_nothing_is_refused(groups: list[np.ndarray]) -> None:
-    with pytest.raises(BadInput, match="at least 1 value per group"):
-        bootstrap(groups)
+@pytest.mark.parametrize(
+    "tasks",
+    [
+        [],
+        [[]],
+        [[np.array([])]],
+        [[np.ones(3), np.array([])]],
+        [[np.ones(3), np.ones(2)]],
+        [[np.ones(3)], [np.ones(2)]],
+        [[np.ones(3)], [np.ones(3)] * 2],
+    ],
+)
+def test_an_interval_of_nothing_or_of_unequal_parts_is_refused(tasks: list[list[np.ndarray]]) -> None:
+    with pytest.raises(BadInput, match="as many training seeds for every task, and as many values"):
+        bootstrap(*tasks)
 
 
 def test_spearman_equals_the_rank_correlation_computed_by_hand_and_lies_in_its_interval() -> None:

@@ -85,7 +85,7 @@ class Evaluation:
         success = wilson(sum(e.success for e in self.episodes), len(self.episodes))
         return {
             "normalized_return": asdict(bootstrap([values])),
-            "iqm": iqm(values),
+            "iqm": float(iqm(values)),
             "success": asdict(success),
             "n_episodes": len(self.episodes),
             "target_return": self.target_return,

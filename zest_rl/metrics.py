@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from zest_rl.errors import BadInput
 
 Values = NDArray[np.float64]
-Statistic = Callable[[Values], float]
+Statistic = Callable[[Values], Values]
 N_RESAMPLES = 10_000
 
 
@@ -36,42 +35,52 @@ def normalized_return(returns: Values, minimum: float, expert: float) -> Values:
     return 100.0 * (np.asarray(returns, dtype=np.float64) - minimum) / (expert - minimum)
 
 
-def mean(values: Values) -> float:
-    """Arithmetic mean."""
-    return float(np.mean(values))
+def mean(values: Values) -> Values:
+    """Arithmetic mean over the last axis."""
+    return np.asarray(np.mean(values, axis=-1))
 
 
-def iqm(values: Values) -> float:
-    """Interquartile mean: the mean of the middle half (Agarwal et al. 2021)."""
-    return float(stats.trim_mean(values, 0.25, axis=None))
+def iqm(values: Values) -> Values:
+    """Interquartile mean over the last axis: the mean of the middle half (Agarwal et al. 2021)."""
+    from scipy import stats  # here, as it takes most of a second to import
+
+    return np.asarray(stats.trim_mean(values, 0.25, axis=-1))
 
 
 def bootstrap(
-    groups: Sequence[Values], statistic: Statistic = mean, *, seed: int = 0, n_resamples: int = N_RESAMPLES
+    *tasks: Sequence[Values], statistic: Statistic = mean, seed: int = 0, n_resamples: int = N_RESAMPLES
 ) -> Estimate:
-    """95 % percentile bootstrap over two levels: training seeds, then episodes within a seed.
+    """95 % percentile bootstrap over two levels: training seeds, then episodes within a seed; stratified by task.
 
     Resampling whole seeds keeps the spread between trainings in the interval; resampling episodes alone would leave
-    it out. With one group (a dataset, or a single seed) only episodes are resampled.
+    it out. With one seed (or a dataset) only episodes are resampled. Tasks are not resampled: the interval is about
+    these tasks (Agarwal et al. 2021, https://arxiv.org/abs/2108.13264).
 
     Args:
-        groups: one (N_i,) array per training seed.
-        statistic: of all values together.
+        tasks: of each task one (N,) array per training seed; as many seeds and episodes for every task.
+        statistic: of all values together, over the last axis.
         seed: of the resampling.
         n_resamples: number of bootstrap samples.
 
     Raises:
-        BadInput: there is no value.
+        BadInput: there is no value, or the numbers of seeds or episodes differ.
     """
-    if not groups or any(len(group) == 0 for group in groups):
-        raise BadInput("an interval needs at least 1 value per group")
+    sizes = {(len(groups), *map(len, groups)) for groups in tasks}
+    if len(sizes) != 1 or len(set(map(len, tasks[0]))) != 1 or len(tasks[0][0]) == 0:
+        raise BadInput(
+            "an interval needs as many training seeds for every task, and as many values (at least 1) for every seed, "
+            f"got {[[len(group) for group in groups] for groups in tasks]}"
+        )
+    values = np.asarray(tasks, dtype=np.float64)  # (tasks, seeds, N)
+    n_tasks, n_seeds, n = values.shape
     rng = np.random.default_rng(seed)
-    samples = np.empty(n_resamples)
-    for i in range(n_resamples):
-        chosen = rng.integers(len(groups), size=len(groups))
-        samples[i] = statistic(np.concatenate([rng.choice(groups[g], size=len(groups[g])) for g in chosen]))
-    low, high = np.quantile(samples, [0.025, 0.975])
-    return Estimate(statistic(np.concatenate(list(groups))), float(low), float(high))
+    task = np.arange(n_tasks)[:, None, None]
+    samples = []
+    for _ in range(n_resamples):
+        chosen = rng.integers(n_seeds, size=(n_tasks, n_seeds, 1))
+        samples.append(values[task, chosen, rng.integers(n, size=values.shape)].ravel())
+    low, high = np.quantile(statistic(np.stack(samples)), [0.025, 0.975])
+    return Estimate(float(statistic(values.ravel())), float(low), float(high))
 
 
 def spearman(a: Values, b: Values, *, seed: int = 0, n_resamples: int = 1000) -> Estimate:
@@ -79,6 +88,8 @@ def spearman(a: Values, b: Values, *, seed: int = 0, n_resamples: int = 1000) ->
 
     NaN where one of the two is constant.
     """
+    from scipy import stats
+
     a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     if a.shape != b.shape or a.ndim != 1 or len(a) < 3:
         raise BadInput(
@@ -101,6 +112,8 @@ def spearman(a: Values, b: Values, *, seed: int = 0, n_resamples: int = 1000) ->
 
 def wilson(n_successes: int, n: int) -> Estimate:
     """Success rate with the 95 % Wilson score interval."""
+    from scipy import stats
+
     if n < 1:
         raise BadInput("a success rate needs at least 1 episode")
     interval = stats.binomtest(n_successes, n).proportion_ci(method="wilson")

@@ -6,11 +6,14 @@ import multiprocessing
 import os
 import threading
 import zipfile
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, TypeVar
 
 import numpy as np
@@ -107,7 +110,7 @@ def map_jobs(
         work: a module-level function (it is sent to worker processes); it must depend on nothing but its job.
         jobs: name → job. The name must identify the job's content.
         folder: where results are left.
-        n_workers: number of processes, default one per core. With one (or one job), work is done in this process.
+        n_workers: number of processes, default one per core; this process is one of them.
         on_done: called with the name of each job when its file is there, also for those found finished.
 
     Raises:
@@ -123,34 +126,57 @@ def map_jobs(
         elif on_done is not None:
             on_done(name)
     n_workers = min(n_workers or n_cores(), len(missing))
-    if n_workers <= 1:
-        for name in missing:
-            _run_job(work, jobs[name], folder / f"{name}.npz")
-            if on_done is not None:
-                on_done(name)
-        return
-    context = multiprocessing.get_context("spawn")  # fork is unsafe beside torch's and the GL library's threads
-    pool = ProcessPoolExecutor(n_workers, mp_context=context, initializer=die_with_parent)
-    with _one_thread_for_children(), pool:
-        pending: dict[Future[None], str] = {}
+    paths = {name: folder / f"{name}.npz" for name in missing}
+    todo = deque(missing)
+    finished: SimpleQueue[tuple[str, BaseException | None]] = SimpleQueue()
+
+    def work_here() -> bool:
+        """Do one job that no other process has begun; return False when there is none."""
         try:
-            for name in missing:
-                pending[pool.submit(_run_job, work, jobs[name], folder / f"{name}.npz")] = name
-            while pending:
-                done, _ = wait(pending, return_when=FIRST_COMPLETED)
-                for future in done:
-                    name = pending.pop(future)
-                    future.result()
-                    if on_done is not None:
-                        on_done(name)
+            name = todo.popleft()
+        except IndexError:
+            return False
+        _run_job(work, jobs[name], paths[name])
+        finished.put((name, None))
+        return True
+
+    def submit() -> None:
+        """Give the next job to another process, and when it is done another one, and so on."""
+        try:
+            name = todo.popleft()
+        except IndexError:
+            return
+        try:
+            pool.submit(_run_job, work, jobs[name], paths[name]).add_done_callback(partial(go_on, name))
+        except BrokenProcessPool as error:
+            finished.put((name, error))
+
+    def go_on(name: str, future: Future[None]) -> None:
+        if future.exception() is None:
+            submit()
+        finished.put((name, future.exception()))
+
+    context = multiprocessing.get_context("spawn")  # fork is unsafe beside torch's and the GL library's threads
+    with ProcessPoolExecutor(max(n_workers - 1, 1), mp_context=context, initializer=die_with_parent) as pool:
+        with _one_thread_for_children():  # submitting starts them
+            for _ in range(n_workers - 1):
+                submit()
+        try:
+            for _ in missing:
+                while finished.empty() and work_here():
+                    pass
+                name, error = finished.get()
+                if error is not None:
+                    raise error
+                if on_done is not None:
+                    on_done(name)
         except BrokenProcessPool as error:
             raise ZestError(
                 f"a worker process died before all of {len(jobs)} parts were done (killed, or out of memory); "
                 "finished parts are kept, run the same command again to go on"
             ) from error
         finally:
-            for future in pending:
-                future.cancel()
+            todo.clear()
 
 
 def chunks(n: int, size: int) -> list[range]:
