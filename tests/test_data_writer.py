@@ -396,6 +396,17 @@ def test_a_killed_writer_leaves_no_dataset_and_the_same_call_completes(root: Pat
     assert left_behind(root) == {f"{NEW}/{name}" for name in (data.DATA_FILE, data.METADATA_FILE, data.MANIFEST_FILE)}
 
 
+def test_a_script_needs_no_main_guard(root: Path, tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from test_data_writer import random_recordings, write\nprint('begun')\nwrite(random_recordings(2))\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    command = [sys.executable, str(script)]
+    assert subprocess.run(command, env=environment, timeout=60, capture_output=True, text=True).stdout == "begun\n"
+    assert listed() == {NEW}
+
+
 def test_of_two_writers_of_one_id_one_wins_whole_and_the_other_is_told(root: Path) -> None:
     writers = {seed: start_writing(3, seed) for seed in (1, 2)}
     output = {seed: process.communicate(timeout=120) for seed, process in writers.items()}

@@ -210,6 +210,19 @@ def test_this_process_is_one_of_the_workers(tmp_path: Path) -> None:
     assert len(processes(tmp_path)) == 2
 
 
+def test_a_script_needs_no_main_guard(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import sys; from pathlib import Path; from zest_rl.parallel import map_jobs; from test_parallel import draw\n"
+        "print('begun')\n"
+        "map_jobs(draw, {str(i): i for i in range(4)}, Path(sys.argv[1]), n_workers=2)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    command = [sys.executable, str(script), str(tmp_path)]
+    assert subprocess.run(command, env=environment, timeout=60, capture_output=True, text=True).stdout == "begun\n"
+    assert len(list(tmp_path.glob("*.npz"))) == 4
+
+
 def test_a_killed_worker_is_a_clear_error_and_finished_parts_are_kept(tmp_path: Path) -> None:
     jobs = dict.fromkeys("abcd", os.getpid())
     with pytest.raises(ZestError, match=r"a worker process died .*finished parts are kept, run the same command again"):

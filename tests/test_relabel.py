@@ -184,6 +184,21 @@ def test_relabeling_again_does_nothing(relabeled: Relabeled) -> None:
     assert times() == before
 
 
+def test_of_two_equal_calls_at_once_the_second_finds_the_work_done(collected: str) -> None:
+    words = ["relabel", collected, "--views", "1", "--tolerance", "0.05", "--n-workers", "1", "--json"]
+    commands = [
+        subprocess.Popen(
+            [sys.executable, "-c", ZEST, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        for _ in range(2)
+    ]
+    outputs = [command.communicate(timeout=120) for command in commands]
+    assert [command.returncode for command in commands] == [0, 0]
+    assert json.loads(outputs[0][0])["dataset"] == json.loads(outputs[1][0])["dataset"]
+    assert sum("is there already" in log for _, log in outputs) <= 1
+    assert len([name for name in data.list_datasets() if "-zest-" in name]) == 1
+
+
 # --- cut runs ---
 
 ZEST = "import sys; from zest_rl.cli import main; sys.exit(main())"

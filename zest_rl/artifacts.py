@@ -149,13 +149,13 @@ def staged_folder(final: Path) -> Iterator[Path]:
 
 @contextmanager
 def lock(target: Path) -> Iterator[None]:
-    """Hold the lock of an artifact; a second process waits (a killed process frees its lock)."""
+    """Hold the lock of an artifact; a second process waits (a killed process frees its lock). May be nested."""
     from filelock import FileLock
 
     path = target.parent / f".{target.name}.lock"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        held = FileLock(path)
+        held = FileLock(path, is_singleton=True)
         held.acquire()
     except OSError as error:
         raise ZestError(f"cannot write {target}: {error.strerror}; choose a folder that can be written to") from error

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from zest_rl import artifacts
 from zest_rl.data import DATA_FILE, MANIFEST_FILE, METADATA_FILE, dataset_path, exists, read_episodes, read_metadata
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.parallel import die_with_parent
+from zest_rl.parallel import die_with_parent, starting_children
 from zest_rl.types import Episode, FloatArray
 
 
@@ -57,7 +57,8 @@ def _in_child(build: Callable[..., None], *args: object) -> None:
     context = multiprocessing.get_context("spawn")
     receive, send = context.Pipe(duplex=False)
     child = context.Process(target=_report_errors, args=(send, build, *args))
-    child.start()
+    with starting_children():
+        child.start()
     send.close()
     try:
         message = receive.recv()

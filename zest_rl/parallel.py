@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import sys
 import threading
 import zipfile
 from collections import deque
@@ -14,6 +15,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
+from types import ModuleType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -45,17 +47,20 @@ def die_with_parent() -> None:
 
 
 @contextmanager
-def _one_thread_for_children() -> Iterator[None]:
-    """Let processes that are started within the context use one core each.
+def starting_children() -> Iterator[None]:
+    """Let processes that are started within the context use one core each, and not run the caller's script again.
 
-    Their results then do not depend on the number of workers, and none waits for another. Set here and not in the
-    child, as the libraries read it when they are loaded.
+    With one core their results do not depend on the number of workers, and none waits for another; set here and not in
+    the child, as the libraries read it when they are loaded. A spawned process would import ``__main__``, which hangs
+    when a script does its work there without ``if __name__ == "__main__"``; what we send it needs no such import.
     """
-    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    main, before = sys.modules["__main__"], {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
+    sys.modules["__main__"] = ModuleType("__main__")
     try:
         yield
     finally:
+        sys.modules["__main__"] = main
         for name, value in before.items():
             if value is None:
                 del os.environ[name]
@@ -158,7 +163,7 @@ def map_jobs(
 
     context = multiprocessing.get_context("spawn")  # fork is unsafe beside torch's and the GL library's threads
     with ProcessPoolExecutor(max(n_workers - 1, 1), mp_context=context, initializer=die_with_parent) as pool:
-        with _one_thread_for_children():  # submitting starts them
+        with starting_children():  # submitting starts them
             for _ in range(n_workers - 1):
                 submit()
         try:

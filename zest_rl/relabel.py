@@ -89,27 +89,33 @@ def relabel(
     target_id = relabeled_id(source_id, digest)
     path = data.dataset_path(target_id)
     n_frames = sum(map(len, states))
+    there = Relabeled(target_id, path, scorer, n_frames, None, already_there=True)
     if data.exists(target_id):
-        return Relabeled(target_id, path, scorer, n_frames, None, already_there=True)
-    scores, n_still = scorer.score_episodes(states, on_progress)
-    write_relabeled(
-        source_id,
-        target_id,
-        [rewards_from_scores(score, reward) for score in scores],
-        scores,
-        description=f"Rewards are ZeST scores ({config.similarity}+{config.features}, {reward}) by {config.embedder}.",
-        zest={
-            "relabel": {
-                "source": source_id,
-                "source_sha256": source_fingerprint,
-                "reward": reward,
-                "scorer": scorer.describe(),
-                "n_still_frames": n_still,
-                "provenance": artifacts.provenance(),
-            }
-        },
-        extra=lambda folder: _leave_scorer(folder, scorer),
-    )
+        return there
+    with artifacts.lock(path):
+        if data.exists(target_id):  # an equal call that ran at the same time
+            return there
+        scores, n_still = scorer.score_episodes(states, on_progress)
+        write_relabeled(
+            source_id,
+            target_id,
+            [rewards_from_scores(score, reward) for score in scores],
+            scores,
+            description=(
+                f"Rewards are ZeST scores ({config.similarity}+{config.features}, {reward}) by {config.embedder}."
+            ),
+            zest={
+                "relabel": {
+                    "source": source_id,
+                    "source_sha256": source_fingerprint,
+                    "reward": reward,
+                    "scorer": scorer.describe(),
+                    "n_still_frames": n_still,
+                    "provenance": artifacts.provenance(),
+                }
+            },
+            extra=lambda folder: _leave_scorer(folder, scorer),
+        )
     return Relabeled(target_id, path, scorer, n_frames, n_still, already_there=False)
 
 
