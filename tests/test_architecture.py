@@ -17,7 +17,7 @@ ROOT = PACKAGE.parent
 
 ORDER = (
     "load_order", "errors", "types", "artifacts", "parallel", "tasks", "data", "data_writer", "metrics", "envs",
-    "experts", "collect",
+    "arm", "experts", "collect",
     "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "relabel", "agents",
     "training", "evaluation", "report", "comparison",
     "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.train", "cli.evaluate",

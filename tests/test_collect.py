@@ -16,14 +16,16 @@ import pytest
 
 from zest_rl import collect, data
 from zest_rl.cli import main
+from zest_rl.cli.collect import FLAWS
 from zest_rl.collect import Behaviour, References, calibrate, measure_references, rollout, run_behaviour
 from zest_rl.envs import HORIZON
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.experts import make_expert
+from zest_rl.experts import DONE_PROGRESS, Manner, make_expert
 from zest_rl.parallel import Arrays, concatenate
 
 NOISY = Behaviour("micro", "expert", noise_max=0.6)
-FIELDS = {"obs", "actions", "qpos", "qvel", "gt_reward", "gt_success", "seed", "level"}
+DRAWN = {"level", "stop_at", "speed"}
+FIELDS = {"obs", "actions", "qpos", "qvel", "gt_reward", "gt_success", "seed", *DRAWN}
 
 
 @pytest.fixture(autouse=True)
@@ -70,9 +72,10 @@ def test_what_a_behaviour_is_decides_where_its_episodes_are_kept() -> None:
         Behaviour("micro", "expert", noise_max=0.61),
         Behaviour("micro", "expert", noise_max=0.6, init_noise=0.01),
         Behaviour("micro", "expert", noise_max=0.6, seed=1),
+        *(NOISY.with_value(name, 0.05) for name in collect.LARGEST),
     ]
     folders = [collect.behaviour_folder(behaviour) for behaviour in (NOISY, *others)]
-    assert len(set(folders)) == 6
+    assert len(set(folders)) == 11
     assert collect.behaviour_folder(Behaviour("micro", "expert", noise_max=0.6)) == folders[0]
     assert not folders[0].exists()
 
@@ -104,6 +107,54 @@ def test_noise_levels_are_drawn_per_episode_up_to_the_largest(first_three: Array
     assert first_three["actions"].dtype == np.float32
 
 
+def manners(behaviour: Behaviour, n: int = 400) -> tuple[list[Manner], np.ndarray]:
+    drawn = [collect.draw_manner(behaviour, np.random.default_rng(i)) for i in range(n)]
+    return [manner for manner, _ in drawn], np.stack([bias for _, bias in drawn])
+
+
+def test_an_expert_with_no_flaws_acts_as_well_as_it_can() -> None:
+    drawn, bias = manners(Behaviour("micro", "expert", noise_max=1.0), 20)
+    assert set(drawn) == {Manner()}
+    assert not bias.any()
+
+
+def test_flaws_are_drawn_per_episode_within_their_bounds() -> None:
+    drawn, bias = manners(Behaviour("micro", "expert", stop_share=0.5, slow_max=0.4, bias_max=0.2, grip_max=0.02))
+    stops = np.array([manner.stop_at for manner in drawn if manner.stop_at < DONE_PROGRESS])
+    assert 0.4 < len(stops) / len(drawn) < 0.6
+    assert 0.1 <= stops.min() < 0.2
+    assert 0.9 < stops.max() <= 1.0
+    speeds = np.array([manner.speed for manner in drawn])
+    assert 0.6 <= speeds.min() < 0.65
+    assert 0.95 < speeds.max() <= 1.0
+    errors = np.abs([manner.grip_error for manner in drawn])
+    assert 0.01 < errors.max() <= 0.02
+    assert 0.1 < np.abs(bias).max() <= 0.2
+    assert bias.dtype == np.float32
+
+
+def test_a_larger_value_moves_every_episode_the_same_way_and_changes_no_other_draw() -> None:
+    base = Behaviour("micro", "expert", stop_share=0.3, slow_max=0.2)
+    some, _ = manners(base)
+    more, bias = manners(base.with_value("stop_share", 0.6).with_value("bias_max", 0.1))
+    assert [manner.speed for manner in some] == [manner.speed for manner in more]
+    assert all(
+        after.stop_at == before.stop_at
+        for before, after in zip(some, more, strict=True)
+        if before.stop_at < DONE_PROGRESS
+    )
+    assert bias.any()
+
+
+def test_an_expert_that_stops_early_leaves_the_door_ajar_and_a_slow_one_is_late() -> None:
+    best = rollout(Behaviour("micro", "expert"), 0)
+    stopping = rollout(Behaviour("micro", "expert", stop_share=1.0), 0)
+    slow = rollout(Behaviour("micro", "expert", slow_max=0.9), 0)
+    assert stopping["stop_at"][0] <= stopping["gt_reward"].max() < 0.999 <= best["gt_reward"].max()
+    assert slow["speed"][0] < 1.0
+    assert collect.returns(slow)[0] < collect.returns(best)[0]
+
+
 def test_without_noise_the_actions_are_the_experts_own() -> None:
     episode = rollout(Behaviour("micro", "expert", noise_max=0.0), 0)
     env = gymnasium.make(collect.env_spec("micro"))
@@ -129,7 +180,7 @@ def test_recordings_are_what_was_rolled_out(first_three: Arrays) -> None:
     for i, recording in enumerate(recordings):
         assert recording.seed == first_three["seed"][i]
         assert not recording.terminated
-        for name in FIELDS - {"seed", "level"}:
+        for name in FIELDS - {"seed", *DRAWN}:
             np.testing.assert_array_equal(getattr(recording, name), first_three[name][i])
 
 
@@ -141,9 +192,13 @@ def test_a_return_leaves_out_the_reward_of_the_reset() -> None:
 @pytest.mark.parametrize(
     ("changes", "rule"),
     [
-        ({"noise_max": -0.1}, r"noise_max must be in \[0, 2.0\] .*, got -0.1"),
+        ({"noise_max": -0.1}, r"noise_max must be in \[0, 2.0\], got -0.1"),
         ({"noise_max": 2.1}, r"noise_max must be in \[0, 2.0\]"),
         ({"noise_max": float("nan")}, "noise_max must be in"),
+        ({"stop_share": 1.1}, r"stop_share must be in \[0, 1.0\], got 1.1"),
+        ({"slow_max": 1.0}, r"slow_max must be in \[0, 0.9\], got 1.0"),
+        ({"bias_max": -1.0}, r"bias_max must be in \[0, 1.0\], got -1.0"),
+        ({"grip_max": 0.2}, r"grip_max must be in \[0, 0.1\], got 0.2"),
         ({"policy": "export"}, "policy must be 'expert' or 'nothing', got 'export'"),
         ({"seed": -1}, "seed must be 0 or positive, got -1"),
     ],
@@ -153,11 +208,11 @@ def test_a_behaviour_that_makes_no_sense_is_refused(changes: dict[str, Any], rul
         Behaviour(**{"task": "micro", "policy": "expert", **changes})
 
 
-def test_no_episodes_and_tasks_without_an_expert_are_refused() -> None:
+def test_no_episodes_and_unknown_tasks_are_refused() -> None:
     with pytest.raises(BadInput, match="n_episodes must be at least 1, got 0"):
         run_behaviour(NOISY, 0)
-    with pytest.raises(BadInput, match="there is no expert for task 'knob2'"):
-        run_behaviour(Behaviour("knob2", "expert"), 1, n_workers=1)
+    with pytest.raises(BadInput, match="unknown task 'knob4'"):
+        run_behaviour(Behaviour("knob4", "expert"), 1, n_workers=1)
 
 
 # --- references and calibration ---------------------------------------------------------------------------------------
@@ -204,10 +259,12 @@ def test_calibration_looks_at_returns_alone_and_meets_the_target(
     curve = Curve()
     rounds: list[tuple[float, float]] = []
     monkeypatch.setattr(collect, "run_behaviour", curve)
-    noise_max = calibrate(NOISY, 7, SCALE, target, tolerance=0.5, on_round=lambda *pair: rounds.append(pair))
-    assert 100 * np.exp(-noise_max) == pytest.approx(target, abs=0.5)
+    found = calibrate(NOISY, "noise_max", 7, SCALE, target, tolerance=0.5, on_round=lambda *pair: rounds.append(pair))
+    assert 100 * np.exp(-found.noise_max) == pytest.approx(target, abs=0.5)
+    assert found == NOISY.with_value("noise_max", found.noise_max)
+    assert len(rounds) <= 7
     assert [behaviour.noise_max for behaviour, _ in curve.asked] == [noise for noise, _ in rounds]
-    assert rounds[-1][0] == noise_max
+    assert rounds[-1][0] == found.noise_max
     assert {(b.task, b.policy, b.seed, n) for b, n in curve.asked} == {("micro", "expert", 0, 7)}
 
 
@@ -216,25 +273,33 @@ def test_a_level_out_of_reach_is_an_error_that_says_how_near_it_came(monkeypatch
     with pytest.raises(
         ZestError, match=r"no noise_max in \[0, 2.0\] brings the dataset to 5.0 ± 0.5 % .*gave 13\.\d+ %"
     ):
-        calibrate(NOISY, 7, SCALE, 5.0)
+        calibrate(NOISY, "noise_max", 7, SCALE, 5.0)
 
 
 @pytest.mark.parametrize("target", [0.0, -3.0, 101.0, float("nan")])
 def test_a_level_that_is_no_share_of_the_expert_is_refused_before_any_episode(target: float) -> None:
     with pytest.raises(BadInput, match=r"must be in \(0, 100\] percent of the expert"):
-        calibrate(NOISY, 7, SCALE, target)
+        calibrate(NOISY, "noise_max", 7, SCALE, target)
+
+
+def test_only_what_makes_the_expert_imperfect_can_be_calibrated() -> None:
+    with pytest.raises(BadInput, match=r"'init_noise' cannot be calibrated; .*noise_max"):
+        calibrate(NOISY, "init_noise", 7, SCALE, 50.0)
+    assert set(FLAWS) == collect.LARGEST.keys()
 
 
 def test_real_episodes_are_calibrated_to_a_level() -> None:
     scale = References(minimum=0.0, expert=71.0, expert_success=1.0, n_episodes=100)
     rounds: list[float] = []
-    noise_max = calibrate(
-        NOISY, 2, scale, 55.0, tolerance=15.0, n_workers=1, on_round=lambda noise, level: rounds.append(noise)
-    )
-    assert noise_max == rounds[-1]
-    assert len(rounds) > 1
-    episodes = run_behaviour(Behaviour("micro", "expert", noise_max=noise_max), 2, n_workers=1)
-    assert 100 * collect.returns(episodes).mean() / 71.0 == pytest.approx(55.0, abs=15.0)
+    behaviour = Behaviour("micro", "expert", noise_max=0.1)
+    found = calibrate(
+        behaviour, "stop_share", 2, scale, 80.0, tolerance=18.0, n_workers=1,
+        on_round=lambda share, level: rounds.append(share),
+    )  # fmt: skip
+    assert found.stop_share == rounds[-1]
+    assert found.noise_max == 0.1
+    episodes = run_behaviour(found, 2, n_workers=1)
+    assert 100 * collect.returns(episodes).mean() / 71.0 == pytest.approx(80.0, abs=18.0)
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
@@ -319,7 +384,8 @@ def test_the_command_typed_again_does_nothing_and_refuses_other_arguments(
         (["--noise-max", "3"], "noise_max must be in [0, 2.0]"),
         (["--seed", "-1"], "seed must be 0 or positive, got -1"),
         (["--dataset", "../x-v0"], "a dataset id must look like"),
-        (["--task", "knob2"], "there is no expert for task 'knob2'"),
+        (["--stop-share", "calibrate"], "one number can be calibrated, got noise_max and stop_share"),
+        (["--noise-max", "high"], "--noise-max"),
     ],
 )
 def test_bad_arguments_end_with_exit_code_2_before_any_episode(words: list[str], rule: str, tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ def test_a_row_sums_up_the_episodes_of_all_its_seeds(evaluated: Path) -> None:
     groups = [latest_evaluation(evaluated / name) for name in ("bc-0", "bc-1")]
     row = method_row(Method("BC", (), "control", "a note", 80.67), groups)
     values = np.concatenate([group.normalized() for group in groups])
-    assert (row.mean, row.iqm) == pytest.approx((values.mean(), metrics.iqm(values)))
+    assert (row.mean, row.iqm) == pytest.approx((values.mean(), float(metrics.iqm(values))))
     assert row.ci_low <= row.mean <= row.ci_high
     assert row.success_rate == np.mean([episode.success for group in groups for episode in group.episodes])
     assert (row.kind, row.note, row.paper_value) == ("control", "a note", 80.67)

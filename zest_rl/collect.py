@@ -1,8 +1,9 @@
-"""Expert + noise → a Minari dataset with successes and failures, at a chosen level of the expert's return.
+"""Imperfect expert → a Minari dataset with successes and failures, at a chosen level of the expert's return.
 
 As in the paper the expert's actions get uniform noise whose level is drawn per trajectory: episode i acts with
-``clip(expert + U(−s_i, s_i))``, ``s_i = u_i · noise_max``, ``u_i ~ U(0, 1)``. Calibration moves `noise_max` alone and
-looks at the returns of these very episodes, never at a trained policy.
+``clip(expert + U(−s_i, s_i))``, ``s_i = u_i · noise_max``, ``u_i ~ U(0, 1)``. The other ways to fall short, each drawn
+per trajectory, too, are fields of `Behaviour`. Calibration moves one of them and looks at the returns of these very
+episodes, never at a trained policy.
 """
 
 from __future__ import annotations
@@ -16,18 +17,20 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl import artifacts
+from zest_rl import artifacts, metrics
 from zest_rl.data_writer import Recording
 from zest_rl.envs import ACT_DIM, ENV_ID, HORIZON
-from zest_rl.errors import BadInput, ZestError
-from zest_rl.experts import add_uniform_noise, make_expert
+from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.experts import DONE_PROGRESS, Manner, add_uniform_noise, make_expert
 from zest_rl.parallel import chunks, concatenate, map_jobs, read_arrays
 from zest_rl.types import FloatArray
 
 EPISODES_PER_JOB = 5
 REFERENCE_STREAM = 2**31
 """Episodes from this index on serve the reference returns; datasets stay below it."""
-LARGEST_NOISE = 2.0
+LARGEST = {"noise_max": 2.0, "stop_share": 1.0, "slow_max": 0.9, "bias_max": 1.0, "grip_max": 0.1}
+"""Bounds of what makes an expert imperfect, and what can be calibrated."""
+STOP_BETWEEN = (0.1, 1.0)
 N_REFERENCE = 100
 """Episodes that measure the expert."""
 N_NOTHING = 10
@@ -44,19 +47,31 @@ class Behaviour:
     """``"expert"``, or ``"nothing"``: the zero action, the lower reference of the normalized return."""
     noise_max: float = 0.0
     """Largest noise level; 1 is the whole action range to either side."""
+    stop_share: float = 0.0
+    """Share of the episodes in which the expert stops early, at a progress drawn from U(`STOP_BETWEEN`)."""
+    slow_max: float = 0.0
+    """The expert makes a share 1 − U(0, slow_max) of its movement at each step."""
+    bias_max: float = 0.0
+    """Largest constant error of an action: each component is off by U(−b, b) all episode, b ~ U(0, bias_max)."""
+    grip_max: float = 0.0
+    """Largest error of the grip, in m: it is off by U(−g, g) along each axis, g ~ U(0, grip_max)."""
     init_noise: float = 0.05
     """Half-width of the uniform noise on the arm's start, in rad."""
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.noise_max <= LARGEST_NOISE:
-            raise BadInput(
-                f"noise_max must be in [0, {LARGEST_NOISE}] (1 = the whole action range), got {self.noise_max}"
-            )
+        for name, largest in LARGEST.items():
+            if not 0 <= getattr(self, name) <= largest:
+                raise BadInput(f"{name} must be in [0, {largest}], got {getattr(self, name)}")
         if self.policy not in ("expert", "nothing"):
             raise BadInput(f"policy must be 'expert' or 'nothing', got {self.policy!r}")
         if self.seed < 0:
             raise BadInput(f"seed must be 0 or positive, got {self.seed}")
+
+    def with_value(self, knob: str, value: float) -> Behaviour:
+        """Return this behaviour with another value of one of `LARGEST`."""
+        values: dict[str, Any] = {knob: value}
+        return replace(self, **values)
 
 
 def env_spec(task: str, init_noise: float = 0.05) -> gymnasium.envs.registration.EnvSpec:
@@ -67,11 +82,12 @@ def env_spec(task: str, init_noise: float = 0.05) -> gymnasium.envs.registration
 
 def rollout(behaviour: Behaviour, index: int) -> Arrays:
     """Run episode `index` of a behaviour: arrays named as in `Recording`, with a leading axis of length 1."""
-    env_seed, level_seed = np.random.SeedSequence([behaviour.seed, index]).generate_state(2)
-    rng = np.random.default_rng(level_seed)
+    env_seed, noise_seed, manner_seed = np.random.SeedSequence([behaviour.seed, index]).generate_state(3)
+    rng = np.random.default_rng(noise_seed)
     level = rng.uniform() * behaviour.noise_max
+    manner, bias = draw_manner(behaviour, np.random.default_rng(manner_seed))
     env = gymnasium.make(env_spec(behaviour.task, behaviour.init_noise))
-    expert = make_expert(behaviour.task, env)
+    expert = make_expert(behaviour.task, env, manner)
     steps: dict[str, list[Any]] = {name: [] for name in ("obs", "actions", "qpos", "qvel", "gt_reward", "gt_success")}
 
     def record(obs: FloatArray, info: dict[str, Any]) -> None:
@@ -83,13 +99,35 @@ def rollout(behaviour: Behaviour, index: int) -> Arrays:
 
     record(*env.reset(seed=int(env_seed)))
     for _ in range(HORIZON):
-        action = expert.act() if behaviour.policy == "expert" else np.zeros(ACT_DIM, np.float32)
+        action = expert.act() + bias if behaviour.policy == "expert" else np.zeros(ACT_DIM, np.float32)
         steps["actions"].append(add_uniform_noise(action, level, rng))
         obs, _, _, _, info = env.step(steps["actions"][-1])
         record(obs, info)
     env.close()
     episode = {name: np.stack(values)[None] for name, values in steps.items()}
-    return {**episode, "seed": np.array([env_seed], dtype=np.int64), "level": np.array([level])}
+    drawn = {"level": level, "stop_at": manner.stop_at, "speed": manner.speed}
+    return {
+        **episode,
+        "seed": np.array([env_seed], dtype=np.int64),
+        **{name: np.array([value]) for name, value in drawn.items()},
+    }
+
+
+def draw_manner(behaviour: Behaviour, rng: np.random.Generator) -> tuple[Manner, FloatArray]:
+    """Draw how the expert acts in one episode, and the constant error (9,) float32 of its actions.
+
+    Every number is drawn whether it is used or not, so that an episode's draws do not depend on which ways to fall
+    short are switched on, nor on how far: what is calibrated moves each episode along a line.
+    """
+    stops, stop_at, slow, grip, bias = rng.uniform(size=5)
+    directions = rng.uniform(-1.0, 1.0, 3 + ACT_DIM)
+    low, high = STOP_BETWEEN
+    manner = Manner(
+        stop_at=low + (high - low) * stop_at if stops < behaviour.stop_share else DONE_PROGRESS,
+        speed=1.0 - slow * behaviour.slow_max,
+        grip_error=tuple(grip * behaviour.grip_max * directions[:3]),
+    )
+    return manner, (bias * behaviour.bias_max * directions[3:]).astype(np.float32)
 
 
 def _rollouts(job: tuple[Behaviour, range]) -> Arrays:
@@ -130,7 +168,10 @@ def run_behaviour(
 
 def behaviour_folder(behaviour: Behaviour) -> Path:
     """Where `run_behaviour` keeps finished parts."""
-    code = [artifacts.hash_file(Path(__file__).with_name(name)) for name in ("collect.py", "envs.py", "experts.py")]
+    code = [
+        artifacts.hash_file(Path(__file__).with_name(name))
+        for name in ("collect.py", "envs.py", "arm.py", "experts.py")
+    ]
     key = {**asdict(behaviour), "code": code, "versions": artifacts.versions()}
     return artifacts.cache_dir() / "episodes" / artifacts.hash_json(key)[:20]
 
@@ -161,7 +202,7 @@ def measure_references(
     """
     runs = {
         policy: run_behaviour(
-            replace(behaviour, policy=policy, noise_max=0.0),
+            Behaviour(behaviour.task, policy, init_noise=behaviour.init_noise, seed=behaviour.seed),
             n,
             first=REFERENCE_STREAM,
             n_workers=n_workers,
@@ -182,46 +223,62 @@ def returns(episodes: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
 
 def calibrate(
     behaviour: Behaviour,
+    knob: str,
     n_episodes: int,
     references: References,
     target: float,
     *,
     tolerance: float = 0.5,
-    n_rounds: int = 10,
+    n_rounds: int = 12,
     n_workers: int | None = None,
     on_round: Callable[[float, float], None] | None = None,
-) -> float:
-    """Find the `noise_max` at which the episodes' mean normalized return meets `target`, by bisection.
+) -> Behaviour:
+    """Find the value of one field of a behaviour at which its episodes' mean normalized return meets `target`.
+
+    The level falls as the value rises. Tried are the value where a straight line between the two nearest levels known
+    meets the target (kept off both ends), and twice the value while none was low enough.
 
     Args:
-        behaviour: task and seed; its `noise_max` is ignored.
+        behaviour: what acts; its field `knob` is ignored.
+        knob: a key of `LARGEST`.
         n_episodes: the dataset's size; the very episodes of the dataset are used.
         references: the two ends of the scale.
         target: percent of the expert, e.g. 81.19.
         tolerance: stop within this many percent.
         n_rounds: at most so many tries.
         n_workers: processes, default one per core.
-        on_round: called with (noise_max, percent) after each.
+        on_round: called with (value, percent) after each.
 
     Raises:
-        BadInput: `target` is not in (0, 100].
-        ZestError: no level within `tolerance` was found.
+        BadInput: `target` is not in (0, 100], or `knob` is not one that can be calibrated.
+        ZestError: no value within `tolerance` was found.
     """
     if not 0 < target <= 100:
         raise BadInput(f"the level to calibrate to must be in (0, 100] percent of the expert, got {target}")
-    low, high = 0.0, LARGEST_NOISE
+    if knob not in LARGEST:
+        raise BadInput(f"{knob!r} cannot be calibrated; {nearest(knob, LARGEST)}")
+    below, above = (0.0, 100.0), None  # (value, level) next to the target; a perfect expert is assumed at 0
+    value, level = 0.3 * LARGEST[knob], 100.0
     for _ in range(n_rounds):
-        noise_max = round((low + high) / 2, 4)
-        episodes = run_behaviour(replace(behaviour, noise_max=noise_max), n_episodes, n_workers=n_workers)
-        level = 100 * (returns(episodes).mean() - references.minimum) / (references.expert - references.minimum)
+        tried = behaviour.with_value(knob, round(value, 4))
+        episodes = run_behaviour(tried, n_episodes, n_workers=n_workers)
+        level = float(metrics.normalized_return(returns(episodes), references.minimum, references.expert).mean())
         if on_round is not None:
-            on_round(noise_max, level)
+            on_round(getattr(tried, knob), level)
         if abs(level - target) <= tolerance:
-            return noise_max
-        low, high = (noise_max, high) if level > target else (low, noise_max)
+            return tried
+        if level > target:
+            below = (value, level)
+        else:
+            above = (value, level)
+        if above is None:
+            value = min(2 * value, LARGEST[knob])
+        else:
+            share = (below[1] - target) / (below[1] - above[1]) if below[1] > above[1] else 0.5
+            value = below[0] + np.clip(share, 0.1, 0.9) * (above[0] - below[0])
     raise ZestError(
-        f"no noise_max in [0, {LARGEST_NOISE}] brings the dataset to {target} ± {tolerance} % of the expert "
-        f"(the last try, {noise_max}, gave {level:.2f} %); collect more episodes or choose noise_max by hand"
+        f"no {knob} in [0, {LARGEST[knob]}] brings the dataset to {target} ± {tolerance} % of the expert (the last "
+        f"try, {getattr(tried, knob)}, gave {level:.2f} %); collect more episodes or choose it by hand"
     )
 
 

@@ -69,7 +69,7 @@ def bootstrap(
     if len(sizes) != 1 or len(set(map(len, tasks[0]))) != 1 or len(tasks[0][0]) == 0:
         raise BadInput(
             "an interval needs as many training seeds for every task, and as many values (at least 1) for every seed, "
-            f"got {[[len(group) for group in groups] for groups in tasks]}"
+            f"got {[[len(group) for group in groups] for groups in tasks]}; evaluate all runs on as many episodes"
         )
     values = np.asarray(tasks, dtype=np.float64)  # (tasks, seeds, N)
     n_tasks, n_seeds, n = values.shape

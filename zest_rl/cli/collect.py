@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from zest_rl.cli.ui import Ui
 from zest_rl.errors import BadInput
 
+FLAWS = ("noise_max", "stop_share", "slow_max", "bias_max", "grip_max")
+
 
 @dataclass(frozen=True)
 class Config:
-    """Collect a noisy dataset of one task: the expert's actions get uniform noise of a level drawn per episode."""
+    """Collect a dataset of one task from an imperfect expert; one number may be calibrated to meet --level."""
 
     task: str = "micro"
     """Which of the kitchen's tasks (knob2, knob3, ldoor, rdoor, sdoor, micro)."""
     n_episodes: int = 100
     """Episodes of 100 steps."""
-    noise_max: float | None = None
-    """Largest noise level (1 = the whole action range); default: calibrated so that the dataset meets --level."""
+    noise_max: float | Literal["calibrate"] = "calibrate"
+    """Largest level of the action noise, drawn per episode (1 = the whole action range)."""
+    stop_share: float | Literal["calibrate"] = 0.0
+    """Share of the episodes in which the expert stops early."""
+    slow_max: float | Literal["calibrate"] = 0.0
+    """Largest share of its speed that the expert lacks, drawn per episode."""
+    bias_max: float | Literal["calibrate"] = 0.0
+    """Largest constant error of the actions, drawn per episode."""
+    grip_max: float | Literal["calibrate"] = 0.0
+    """Largest error of the grip in m, drawn per episode."""
     level: float = 81.19
     """Mean normalized return to calibrate to, in percent of the expert; the default is the paper's "Demo"."""
     seed: int = 0
@@ -31,12 +41,26 @@ class Config:
     def __post_init__(self) -> None:
         if self.n_episodes < 1:
             raise BadInput(f"n-episodes must be at least 1, got {self.n_episodes}")
+        if len(self.calibrated) > 1:
+            raise BadInput(
+                f"one number can be calibrated, got {' and '.join(self.calibrated)}; give the others a value"
+            )
+
+    @property
+    def flaws(self) -> dict[str, float | Literal["calibrate"]]:
+        """What makes the expert imperfect."""
+        return {name: getattr(self, name) for name in FLAWS}
+
+    @property
+    def calibrated(self) -> list[str]:
+        """Names of the numbers that are to be calibrated."""
+        return [name for name, value in self.flaws.items() if value == "calibrate"]
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Measure the references, calibrate if asked to, roll out, write."""
     import shutil
-    from dataclasses import asdict, replace
+    from dataclasses import asdict
 
     import numpy as np
 
@@ -58,29 +82,30 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         ui.say(f"{dataset_id} is there already, nothing to do")
         return {**made_by["result"], "dataset": dataset_id, "path": str(path), "next": _next(dataset_id)}
 
-    behaviour = collect.Behaviour(config.task, "expert", seed=config.seed, noise_max=config.noise_max or 0.0)
+    given = {name: value for name, value in config.flaws.items() if value != "calibrate"}
+    behaviour = collect.Behaviour(config.task, "expert", seed=config.seed, **given)
     n_reference = collect.N_REFERENCE
     with ui.progress("reference returns (expert, doing nothing)", n_reference + collect.N_NOTHING) as advance:
         references = collect.measure_references(behaviour, n_reference, n_workers=config.n_workers, on_progress=advance)
     ui.say(f"expert: return {references.expert:.2f}, success {references.expert_success:.0%}")
-    noise_max = config.noise_max
-    if noise_max is None:
-        noise_max = collect.calibrate(
+    if config.calibrated:
+        (knob,) = config.calibrated
+        behaviour = collect.calibrate(
             behaviour,
+            knob,
             config.n_episodes,
             references,
             config.level,
             n_workers=config.n_workers,
-            on_round=lambda noise, level: ui.say(f"noise up to {noise:.4f}: {level:.2f} % of the expert"),
+            on_round=lambda value, level: ui.say(f"{knob} {value:.4f}: {level:.2f} % of the expert"),
         )
-    behaviour = replace(behaviour, noise_max=noise_max)
     with ui.progress("episodes", config.n_episodes) as advance:
         episodes = collect.run_behaviour(behaviour, config.n_episodes, n_workers=config.n_workers, on_progress=advance)
     normalized = metrics.normalized_return(collect.returns(episodes), references.minimum, references.expert)
     successes = episodes["gt_success"].any(axis=1)
     result = {
         "n_episodes": config.n_episodes,
-        "noise_max": noise_max,
+        **{name: getattr(behaviour, name) for name in FLAWS},
         "expert_return": references.expert,
         "expert_success": references.expert_success,
         "minimum_return": references.minimum,
@@ -94,9 +119,10 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         env_spec=collect.env_spec(config.task).to_json(),
         ref_min_score=references.minimum,
         ref_max_score=references.expert,
-        algorithm_name="scripted expert with uniform action noise",
-        description=f"Kitchen task {config.task}: scripted expert with uniform action noise of a level "
-        f"s ~ U(0, {noise_max}) drawn per episode, {config.n_episodes} episodes of 100 steps.",
+        algorithm_name="imperfect scripted expert",
+        description=f"Kitchen task {config.task}: {config.n_episodes} episodes of 100 steps by a scripted expert with "
+        + ", ".join(f"{name} {value}" for name in FLAWS if (value := getattr(behaviour, name)))
+        + " (drawn per episode, see zest_rl.collect.Behaviour).",
         zest={"collect": {"asked": asked, "result": result, "provenance": artifacts.provenance()}},
     )
     shutil.rmtree(collect.behaviour_folder(behaviour), ignore_errors=True)
