@@ -4,10 +4,12 @@ import json
 import os
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import settings
 
@@ -108,6 +110,54 @@ def trained(trained_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "trained" / "minari"))
     monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "trained" / "cache"))
     return tmp_path / "trained" / "runs"
+
+
+@pytest.fixture(scope="module")
+def short_videos() -> Iterator[None]:
+    """Write the first 2 states of a video only."""
+    from zest_rl import comparison, videos
+
+    write_video = videos.write_video
+
+    def short_video(states: np.ndarray, path: Path, **_: object) -> Path:
+        return write_video(states[:2], path, size=64)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(videos, "write_video", short_video)
+        patch.setattr(comparison, "write_video", short_video)
+        yield
+
+
+@pytest.fixture
+def zest(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
+    """Run a verb that must succeed, and return its JSON document."""
+
+    def run(*words: str | Path) -> dict[str, Any]:
+        from zest_rl import cli
+
+        code = cli.main([*map(str, words), "--json"])
+        out, err = capsys.readouterr()
+        assert code == 0, err
+        document: dict[str, Any] = json.loads(out)
+        return document
+
+    return run
+
+
+@pytest.fixture
+def refusal(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
+    """Run a verb that must fail, and return its exit code and message."""
+
+    def run(*words: str | Path) -> tuple[int, str]:
+        from zest_rl import cli
+
+        code = cli.main(list(map(str, words)))
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert "Traceback" not in err
+        return code, err
+
+    return run
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ ORDER = (
     "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "relabel", "agents",
     "training", "evaluation", "report", "comparison",
     "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.train", "cli.evaluate",
-    "cli.report", "cli.reproduce",
+    "cli.report", "cli.plans", "cli.reproduce",
 )  # fmt: skip
 """The pipeline: a module imports only what stands before it. A folder is listed once, its files share the place."""
 

@@ -165,8 +165,8 @@ def test_the_newest_evaluation_is_shown_unless_one_is_asked_for(evaluated: Path)
     newer = replace(CONFIG, n_episodes=3)
     evaluate(evaluated / "bc-0", newer, n_workers=1)
     assert latest_evaluation(evaluated / "bc-0").config == newer
-    methods = [Method("BC", (evaluated / "bc-0",), "control")]
-    rows = [compare("T", methods, source_id=None, goals={}, config=which).table[0] for which in (None, CONFIG, newer)]
+    methods = [Method("BC", (evaluated / "bc-0",), "control", evaluation=which) for which in (None, CONFIG, newer)]
+    rows = [compare("T", [method], source_id=None, goals={}).table[0] for method in methods]
     assert [row.n_episodes for row in rows] == [3, 2, 3]
 
 

@@ -23,7 +23,7 @@ from zest_rl.cli import main
 from zest_rl.embed import STATES_PER_SHARD
 from zest_rl.errors import BadInput
 from zest_rl.frames import Views
-from zest_rl.relabel import GOAL_FOLDER, SCORER_FILE, Relabeled, relabel, relabeled_id, rewards_from_scores
+from zest_rl.relabel import GOAL_FOLDER, SCORER_FILE, Relabeled, relabel, relabeled_id, rewards_from_scores, shuffled
 from zest_rl.scorer import Scorer, ScorerConfig
 
 CONFIG = ScorerConfig(Views("micro", n_views=1, size=96, tolerance=0.05), "same-scene")
@@ -80,6 +80,16 @@ def test_difference_rewards_add_up_to_the_change_of_the_score() -> None:
 def test_an_unknown_reward_is_refused_with_the_nearest_right_one() -> None:
     with pytest.raises(BadInput, match="unknown reward 'diference'; did you mean 'difference'"):
         rewards_from_scores(np.zeros(2, np.float32), "diference")  # type: ignore[arg-type]
+
+
+def test_shuffled_scores_are_the_scores_of_other_episodes() -> None:
+    scores = [np.full(3, i, np.float32) for i in range(20)]
+    one, same, other = (shuffled(scores, seed) for seed in (0, 0, 1))
+    assert sorted(score[0] for score in one) == list(range(20))
+    assert [score[0] for score in one] == [score[0] for score in same]
+    assert len({tuple(score[0] for score in order) for order in (scores, one, other)}) == 3
+    with pytest.raises(BadInput, match="equally long episodes only"):
+        shuffled([np.zeros(3, np.float32), np.zeros(4, np.float32)], 0)
 
 
 # --- the relabeled dataset ---
@@ -170,6 +180,20 @@ def test_the_name_says_where_the_dataset_comes_from_and_is_a_hash_of_how_it_was_
     renamed = relabel(SOURCE, replace(CONFIG, goal=str(places / "same pictures, other name")), n_workers=1)
     assert renamed.dataset_id == others[-1].dataset_id
     assert renamed.already_there
+
+
+def test_a_null_control_and_a_choice_of_goals_are_datasets_of_their_own(relabeled: Relabeled, places: Path) -> None:
+    null = relabel(SOURCE, CONFIG, shuffle=3, n_workers=1)
+    rewards, nulls = ([e.rewards for e in data.read_episodes(name)] for name in (relabeled.dataset_id, null.dataset_id))
+    order = np.random.default_rng(3).permutation(4)
+    for i, reward in zip(order, nulls, strict=True):
+        np.testing.assert_array_equal(reward, rewards[i])
+    assert data.read_metadata(null.dataset_id)["zest"]["relabel"]["shuffle"] == 3
+    chosen = relabel(SOURCE, replace(CONFIG, goal=str(DRAWINGS), goal_share=0.4), n_workers=1)
+    kept = data.read_metadata(chosen.dataset_id)["zest"]["relabel"]["kept_goals"]
+    assert len(kept) == 1
+    assert len(list((chosen.path / GOAL_FOLDER / "goal").iterdir())) == 1
+    assert len({relabeled.dataset_id, null.dataset_id, chosen.dataset_id}) == 3
 
 
 def test_relabeling_again_does_nothing(relabeled: Relabeled) -> None:

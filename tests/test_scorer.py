@@ -22,6 +22,7 @@ from zest_rl.tasks import TASKS
 
 VIEWS = Views("micro", n_views=2, size=96, tolerance=0.05)
 CONFIG = ScorerConfig(VIEWS, "same-scene")
+DRAWINGS = Path(__file__).parent.parent / "datasets" / "goals" / "micro"
 MICROWAVE = 22
 """Place of the microwave's joint in qpos."""
 
@@ -246,3 +247,36 @@ def test_a_missing_or_damaged_scorer_is_an_error_that_says_what_to_do(scorer: Sc
     rewrite(path, colour="blue")
     with pytest.raises(ZestError, match=expected):
         Scorer.load(path)
+
+
+# --- goals without ground truth ---
+
+
+def test_the_goals_that_the_episodes_come_nearest_to_are_kept(episodes: list[np.ndarray], tmp_path: Path) -> None:
+    config = replace(CONFIG, goal=str(DRAWINGS), goal_share=0.5)
+    scorer = Scorer.build(config, episodes[0][0], n_workers=1)
+    whole = Scorer.build(replace(config, goal_share=1.0), episodes[0][0], n_workers=1)
+    n_goals = len(whole.goals)
+    best = []
+    for k in range(n_goals):
+        alone = Scorer(config, whole.starts, whole.goals[[k]], "", n_workers=1)
+        best.append(np.mean([score.max() for score in alone.score_episodes(episodes)[0]]))
+    kept = scorer.select_goals(episodes)
+    assert sorted(kept) == sorted(np.argsort(best)[-len(kept) :])
+    assert len(kept) == round(n_goals / 2)
+    np.testing.assert_array_equal(scorer.goals, whole.goals[kept])
+    assert scorer.goal is not None
+    assert len(scorer.goal.goals) == len(kept)
+    scorer.save(tmp_path / "scorer.safetensors")
+    loaded = Scorer.load(tmp_path / "scorer.safetensors", n_workers=1)
+    for one, other in zip(scorer.score_episodes(episodes)[0], loaded.score_episodes(episodes)[0], strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert scorer.fingerprint() != whole.fingerprint()
+
+
+def test_one_goal_is_always_kept_and_a_share_of_none_is_refused(episodes: list[np.ndarray]) -> None:
+    scorer = Scorer.build(replace(CONFIG, goal_share=0.01), episodes[0][0], n_workers=1)
+    assert list(scorer.select_goals(episodes)) == [0]
+    assert scorer.goals.shape[-2] == 1
+    with pytest.raises(BadInput, match=r"goal_share must be in \(0, 1\], got 0"):
+        replace(CONFIG, goal_share=0.0)

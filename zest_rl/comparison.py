@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from zest_rl.errors import BadInput
 from zest_rl.evaluation import Evaluation, EvaluationConfig, check_finished, evaluation_folder, read_evaluation
 from zest_rl.images import list_images, read_image
 from zest_rl.relabel import GOAL_FOLDER, SCORER_FILE
-from zest_rl.report import Curve, EpisodePanel, GoalPanel, MethodRow, Report, Scatter
+from zest_rl.report import Curve, EpisodePanel, GoalPanel, MethodRow, Report, Scatter, Section
 from zest_rl.report.data import Kind
 from zest_rl.scorer import Scorer
 from zest_rl.videos import FPS, representative, write_video
@@ -37,6 +37,18 @@ class Method:
     note: str = ""
     paper: float | None = None
     """The paper's figure, in percent of the expert."""
+    evaluation: EvaluationConfig | None = None
+    """Which evaluation of each run; None takes the newest."""
+
+    def evaluations(self) -> list[Evaluation]:
+        """Read the evaluations, one per run.
+
+        Raises:
+            BadInput: a run was not evaluated.
+        """
+        if self.evaluation is None:
+            return [latest_evaluation(run) for run in self.runs]
+        return [read_evaluation(evaluation_folder(run, self.evaluation)) for run in self.runs]
 
 
 def methods_of_runs(runs: Sequence[Path]) -> tuple[Method, ...]:
@@ -103,45 +115,51 @@ def latest_evaluation(run: Path) -> Evaluation:
     return read_evaluation(results[-1].parent)
 
 
-def method_row(method: Method, evaluations: Sequence[Evaluation]) -> MethodRow:
-    """Summarise the evaluations of one method, one per seed."""
-    groups = [evaluation.normalized() for evaluation in evaluations]
-    estimate = metrics.bootstrap(groups)
-    episodes = [episode for evaluation in evaluations for episode in evaluation.episodes]
-    return MethodRow(
+def method_row(method: Method, *tasks: Sequence[Evaluation]) -> MethodRow:
+    """Summarise the evaluations of one method: for each task one per seed."""
+    groups = [[evaluation.normalized() for evaluation in evaluations] for evaluations in tasks]
+    episodes = [episode for evaluations in tasks for evaluation in evaluations for episode in evaluation.episodes]
+    return _row(
+        groups,
+        float(np.mean([episode.success for episode in episodes])),
         method=method.name,
-        mean=estimate.value,
-        ci_low=estimate.low,
-        ci_high=estimate.high,
-        iqm=float(metrics.iqm(np.concatenate(groups))),
-        success_rate=float(np.mean([episode.success for episode in episodes])),
-        n_seeds=len(groups),
-        n_episodes=len(episodes),
         kind=method.kind,
         note=method.note,
         paper_value=method.paper,
     )
 
 
-def dataset_row(dataset_id: str, *, paper: float | None = None) -> MethodRow:
-    """Summarise the dataset itself (the paper's "Demo")."""
-    facts, truth = data.describe(dataset_id), data.read_ground_truth(dataset_id)
-    values = metrics.normalized_return(
-        np.array([episode.episode_return for episode in truth]), facts["ref_min_score"], facts["ref_max_score"]
-    )
-    estimate = metrics.bootstrap([values])
-    return MethodRow(
+def dataset_row(*dataset_ids: str, paper: float | None = None) -> MethodRow:
+    """Summarise the datasets themselves, one per task (the paper's "Demo")."""
+    groups, successes = [], []
+    for dataset_id in dataset_ids:
+        facts, truth = data.describe(dataset_id), data.read_ground_truth(dataset_id)
+        returns = np.array([episode.episode_return for episode in truth])
+        groups.append([metrics.normalized_return(returns, facts["ref_min_score"], facts["ref_max_score"])])
+        successes += [episode.success for episode in truth]
+    return _row(
+        groups,
+        float(np.mean(successes)),
         method="Demo",
+        kind="dataset",
+        note="the dataset's own episodes",
+        paper_value=paper,
+    )
+
+
+def _row(groups: list[list[NDArray[np.float64]]], success_rate: float, **named: Any) -> MethodRow:
+    """Summarise normalized returns, one (N,) array per task and seed."""
+    estimate = metrics.bootstrap(*groups)
+    values = np.concatenate([group for task in groups for group in task])
+    return MethodRow(
         mean=estimate.value,
         ci_low=estimate.low,
         ci_high=estimate.high,
         iqm=float(metrics.iqm(values)),
-        success_rate=float(np.mean([episode.success for episode in truth])),
-        n_seeds=1,
-        n_episodes=len(truth),
-        kind="dataset",
-        note="the dataset's own episodes",
-        paper_value=paper,
+        success_rate=success_rate,
+        n_seeds=len(groups[0]),
+        n_episodes=len(values),
+        **named,
     )
 
 
@@ -220,7 +238,6 @@ def compare(
     *,
     source_id: str | None,
     goals: dict[str, str],
-    config: EvaluationConfig | None = None,
     paper_demo: float | None = None,
     caveats: Sequence[str] = (),
     details: dict[str, Any] | None = None,
@@ -232,7 +249,6 @@ def compare(
         methods: rows, in the order of the table.
         source_id: the collected dataset, for the "Demo" row; None leaves the row out.
         goals: name → relabeled dataset.
-        config: which evaluation of each run; None takes the newest.
         paper_demo: the paper's figure for "Demo", in percent.
         caveats: sentences shown at the end.
         details: shown as collapsed JSON, beside the runs' own meta.
@@ -244,13 +260,7 @@ def compare(
     tasks = {json.loads(meta["dataset"]["env_spec"])["kwargs"]["task"] for meta in metas.values()}
     if len(tasks) != 1:
         raise BadInput(f"a report compares runs of one task, got {', '.join(sorted(tasks))}; write one report per task")
-    evaluations = {
-        method.name: [
-            latest_evaluation(run) if config is None else read_evaluation(evaluation_folder(run, config))
-            for run in method.runs
-        ]
-        for method in methods
-    }
+    evaluations = {method.name: method.evaluations() for method in methods}
     rows = [method_row(method, evaluations[method.name]) for method in methods]
     if source_id is not None:
         rows.insert(0, dataset_row(source_id, paper=paper_demo))
@@ -262,16 +272,9 @@ def compare(
     panels = [p for m in shown for p in episode_panels(m.name, evaluations[m.name][0], scorer)]
     if scorer is not None:
         scorer.states.flush()
-    best = max((row for row in rows if row.kind == "method"), key=lambda row: row.mean, default=None)
     return Report(
         title=title,
-        summary_sentence=(
-            f"{best.method} reaches {best.mean:.1f} % of the expert's return "
-            f"(95 % interval {best.ci_low:.1f} to {best.ci_high:.1f}, {best.n_seeds} "
-            f"seed{'s' if best.n_seeds > 1 else ''}, {best.n_episodes} episodes)."
-            if best is not None
-            else ""
-        ),
+        summary_sentence=_best_sentence(rows),
         table=tuple(rows),
         goals=tuple(goal_panel(name, dataset_id, scatters[name]) for name, dataset_id in goals.items()),
         episodes=tuple(panels),
@@ -279,6 +282,66 @@ def compare(
         curves=tuple(curve for method in methods if (curve := learning_curve(method)) is not None),
         details={**(details or {}), **{f"run {Path(run).name}": meta for run, meta in metas.items()}},
         caveats=(*caveats, *_unequal_starts(evaluations)),
+    )
+
+
+def overview(
+    title: str,
+    methods: Mapping[str, Sequence[Method]],
+    reports: Mapping[str, Report],
+    pages: Mapping[str, str],
+    *,
+    sources: Sequence[str],
+    paper_demo: float | None = None,
+    caveats: Sequence[str] = (),
+    details: dict[str, Any] | None = None,
+) -> Report:
+    """Build the page over several tasks: every method over all tasks together, then each task.
+
+    Args:
+        title: headline.
+        methods: task → rows; the same names for every task.
+        reports: task → its own report.
+        pages: task → file name of that report, beside this one.
+        sources: the collected datasets.
+        paper_demo: the paper's figure for "Demo", in percent.
+        caveats: sentences shown at the end.
+        details: shown as collapsed JSON.
+    """
+    by_name = {name: [m for of_task in methods.values() for m in of_task if m.name == name] for name in _names(methods)}
+    rows = [method_row(group[0], *(method.evaluations() for method in group)) for group in by_name.values()]
+    rows.insert(0, dataset_row(*sources, paper=paper_demo))
+    return Report(
+        title=title,
+        summary_sentence=_best_sentence(rows, f" over {len(reports)} tasks"),
+        table=tuple(rows),
+        sections=tuple(Section(task, report.table, pages[task]) for task, report in reports.items()),
+        scatters=tuple(
+            replace(scatter, name=f"{task}: {scatter.name}")
+            for task, report in reports.items()
+            for scatter in report.scatters
+        ),
+        curves=tuple(
+            replace(curve, quantity=f"{task}: {curve.quantity}")
+            for task, report in reports.items()
+            for curve in report.curves
+        ),
+        details=details or {},
+        caveats=tuple(caveats),
+    )
+
+
+def _names(methods: Mapping[str, Sequence[Method]]) -> list[str]:
+    return [method.name for method in next(iter(methods.values()))]
+
+
+def _best_sentence(rows: Sequence[MethodRow], where: str = "") -> str:
+    best = max((row for row in rows if row.kind == "method"), key=lambda row: row.mean, default=None)
+    if best is None:
+        return ""
+    return (
+        f"{best.method} reaches {best.mean:.1f} % of the expert's return{where} (95 % interval {best.ci_low:.1f} to "
+        f"{best.ci_high:.1f}, {best.n_seeds} seed{'s' if best.n_seeds > 1 else ''}, {best.n_episodes} episodes)."
     )
 
 

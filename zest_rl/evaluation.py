@@ -1,6 +1,6 @@
 """Policy + environment (+ scorer for the online return-to-go) → episode results. Imports no training.
 
-Episodes run in lockstep, `EPISODES_PER_JOB` at a time, one part per core; every policy meets the same starts (paired
+Episodes run in lockstep within a part, one part per core at a time; every policy meets the same starts (paired
 seeds). The Decision Transformer's return-to-go falls by the *online ZeST score* of each new state, in the units of the
 rewards it was trained on. Ground-truth rewards are recorded, and shown to no policy but one that was trained on them.
 """
@@ -29,8 +29,9 @@ from zest_rl.scorer import Scorer
 from zest_rl.types import EpisodeResult
 
 Rtg = Literal["online", "constant", "schedule"]
-EPISODES_PER_JOB = 5
-"""Small enough that all cores have work and a cut evaluation loses little; a batch of 5 hardly costs more per step."""
+EPISODES_PER_JOB, N_JOBS = 5, 10
+"""An evaluation is cut into `N_JOBS` parts of at least so many episodes: small enough that all cores have work and a
+cut evaluation loses little, large enough that a policy acts on a batch."""
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -250,7 +251,7 @@ def evaluate(
         )
     folder = evaluation_folder(run, config)
     jobs = {}
-    for part in chunks(config.n_episodes, EPISODES_PER_JOB):
+    for part in chunks(config.n_episodes, max(EPISODES_PER_JOB, config.n_episodes // N_JOBS)):
         seeds = range(config.seed + part.start, config.seed + part.stop)
         jobs[f"seeds-{seeds.start}-{seeds.stop}{'-scored' if scored else ''}"] = (run, config, seeds, scored, device)
     map_jobs(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -54,6 +54,17 @@ def rewards_from_scores(scores: FloatArray, reward: Reward = "level") -> FloatAr
     raise BadInput(f"unknown reward {reward!r}; {nearest(reward, ('level', 'difference'))}")
 
 
+def shuffled(scores: Sequence[FloatArray], seed: int) -> list[FloatArray]:
+    """Hand the scores of whole episodes to other episodes: a reward of the same shape that tells nothing.
+
+    Raises:
+        BadInput: the episodes are not equally long.
+    """
+    if len({len(score) for score in scores}) > 1:
+        raise BadInput("scores can be shuffled among equally long episodes only; leave --shuffle out for this dataset")
+    return [scores[i] for i in np.random.default_rng(seed).permutation(len(scores))]
+
+
 def relabeled_id(source_id: str, digest: str) -> str:
     """``zest/kitchen-micro-noisy-v0`` → ``zest/kitchen-micro-noisy-zest-1a2b3c4d-v0``."""
     return re.sub(r"-v(\d+)$", rf"-zest-{digest[:8]}-v\1", source_id)
@@ -64,6 +75,7 @@ def relabel(
     config: ScorerConfig,
     *,
     reward: Reward = "level",
+    shuffle: int | None = None,
     device: str = "auto",
     n_workers: int | None = None,
     on_progress: Callable[[int, int], None] | None = None,
@@ -74,6 +86,7 @@ def relabel(
         source_id: a dataset with recorded simulator state.
         config: the scorer.
         reward: the level of the score at each step, or its change.
+        shuffle: null control: give each episode the scores of another one, drawn with this seed.
         device: where the embedder runs.
         n_workers: processes that render and embed, default one per core.
         on_progress: called with (parts embedded, parts in all).
@@ -85,7 +98,7 @@ def relabel(
     states = data.read_states(source_id)
     scorer = Scorer.build(config, states[0][0], device=device, n_workers=n_workers)
     source_fingerprint = data.fingerprint(source_id)
-    digest = artifacts.hash_json([source_fingerprint, scorer.fingerprint(), reward])
+    digest = artifacts.hash_json([source_fingerprint, scorer.fingerprint(), reward, shuffle])
     target_id = relabeled_id(source_id, digest)
     path = data.dataset_path(target_id)
     n_frames = sum(map(len, states))
@@ -95,7 +108,10 @@ def relabel(
     with artifacts.lock(path):
         if data.exists(target_id):  # an equal call that ran at the same time
             return there
+        kept = scorer.select_goals(states, on_progress) if config.goal_share < 1 else None
         scores, n_still = scorer.score_episodes(states, on_progress)
+        if shuffle is not None:
+            scores = shuffled(scores, shuffle)
         write_relabeled(
             source_id,
             target_id,
@@ -109,6 +125,8 @@ def relabel(
                     "source": source_id,
                     "source_sha256": source_fingerprint,
                     "reward": reward,
+                    "shuffle": shuffle,
+                    "kept_goals": None if kept is None else kept.tolist(),
                     "scorer": scorer.describe(),
                     "n_still_frames": n_still,
                     "provenance": artifacts.provenance(),

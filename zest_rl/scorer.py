@@ -7,8 +7,8 @@ file (the goal's embeddings) with its config, so that neither the goal pictures 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -38,6 +38,12 @@ class ScorerConfig:
     features: Features = "delta"
     similarity: Similarity = "cos"
     precision: Precision = "auto"
+    goal_share: float = 1.0
+    """Share of the goals that are used: those that the episodes come nearest to (`Scorer.select_goals`)."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.goal_share <= 1:
+            raise BadInput(f"goal_share must be in (0, 1], got {self.goal_share}")
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
@@ -114,17 +120,52 @@ class Scorer:
         Returns:
             (T+1,) float32 scores per episode; and how many frames after the first had no change in any view.
         """
-        embeddings, index = self.states.embed(np.concatenate(list(states)), on_progress)
-        scores, n_still, offset = [], 0, 0
-        for episode in states:
-            steps = index[offset : offset + len(episode)]
-            offset += len(episode)
-            distinct, inverse = np.unique(steps, return_inverse=True)  # resting objects repeat their state
-            frames = embeddings[np.concatenate([steps[:1], distinct])]  # x_0 first, as the scores want it
+        scores, n_still = [], 0
+        for frames, inverse in self._frames(states, on_progress):
             scores.append(self._score(frames)[1:][inverse])
             still = np.all([zero_deltas(frames[:, view]) for view in range(frames.shape[1])], axis=0)
             n_still += int(still[1:][inverse[1:]].sum())
         return scores, n_still
+
+    def select_goals(
+        self, states: Sequence[NDArray[np.float64]], on_progress: Callable[[int, int], None] | None = None
+    ) -> NDArray[np.intp]:
+        """Keep the share ``config.goal_share`` of the goals (at least one) and forget the others.
+
+        The rule needs no ground truth ("goal images with high similarity", Cui et al. §5.3): kept are the goals with
+        the highest best score of an episode, averaged over episodes.
+
+        Args:
+            states: (T+1, nq) simulator positions per episode.
+            on_progress: called with (parts embedded, parts in all).
+
+        Returns:
+            Indices of the goals that are kept, in their order.
+        """
+        n_goals = self.goals.shape[-2]
+        n_kept = max(1, round(self.config.goal_share * n_goals))
+        best = np.zeros(n_goals)
+        for frames, _ in self._frames(states, on_progress):
+            for k in range(n_goals):
+                goal = self.goals[..., k : k + 1, :]
+                best[k] += score_views(frames, self.starts, goal, self.config.features, self.config.similarity).max()
+        kept = np.sort(np.argsort(-best, kind="stable")[:n_kept])
+        self.goals = self.goals[..., kept, :]
+        if self.goal is not None and not self.goal.per_view:
+            self.goal = replace(self.goal, goals=tuple(self.goal.goals[k] for k in kept))
+        return kept
+
+    def _frames(
+        self, states: Sequence[NDArray[np.float64]], on_progress: Callable[[int, int], None] | None
+    ) -> Iterator[tuple[FloatArray, NDArray[np.intp]]]:
+        """Yield per episode the (n, V, D) embeddings of x_0 and its distinct states, and which one each frame is."""
+        embeddings, index = self.states.embed(np.concatenate(list(states)), on_progress)
+        offset = 0
+        for episode in states:
+            steps = index[offset : offset + len(episode)]
+            offset += len(episode)
+            distinct, inverse = np.unique(steps, return_inverse=True)  # resting objects repeat their state
+            yield embeddings[np.concatenate([steps[:1], distinct])], inverse  # x_0 first, as the scores want it
 
     def score_now(self, first: NDArray[np.float64], current: NDArray[np.float64]) -> FloatArray:
         """Score one state of each of N running episodes.
@@ -160,7 +201,7 @@ class Scorer:
     def fingerprint(self) -> str:
         """Hash of all that a score depends on; names of files and folders are left out."""
         described = self.describe()
-        config = {k: v for k, v in described["config"].items() if k in ("features", "similarity")}
+        config = {k: v for k, v in described["config"].items() if k in ("features", "similarity", "goal_share")}
         hashes = [described[k] for k in ("goal_sha256", "embedder_sha256", "views_sha256")]
         return artifacts.hash_json([config, hashes])
 

@@ -33,8 +33,8 @@ class Config:
     """Mean normalized return to calibrate to, in percent of the expert; the default is the paper's "Demo"."""
     seed: int = 0
     """Of starts, noise levels and noise."""
-    dataset: str | None = None
-    """Id of the new Minari dataset; default zest/kitchen-TASK-noisy-v0."""
+    dataset: str = "zest/kitchen-{task}-noisy-v0"
+    """Id of the new Minari dataset; {task} stands for the task."""
     n_workers: int | None = None
     """Processes; default one per core."""
 
@@ -69,7 +69,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     from zest_rl.tasks import get_task
 
     get_task(config.task)
-    dataset_id = config.dataset or f"zest/kitchen-{config.task}-noisy-v0"
+    dataset_id = config.dataset.replace("{task}", config.task)
     asked = {key: value for key, value in asdict(config).items() if key not in ("dataset", "n_workers")}
     path = data.dataset_path(dataset_id)
     if data.exists(dataset_id):

@@ -26,6 +26,10 @@ class Config:
     """Cosine, or minus the Euclidean distance."""
     reward: Literal["level", "difference"] = "level"
     """The score after each action, or its change (an ablation)."""
+    goal_share: float = 1.0
+    """Share of the goal pictures to use: those that the dataset's frames come nearest to."""
+    shuffle: int | None = None
+    """Null control: give each episode the scores of another one, drawn with this seed."""
     views: int = 8
     """Cameras around the object; scores are averaged over them."""
     show_robot: bool = False
@@ -59,7 +63,13 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         tolerance=config.tolerance,
     )
     scorer_config = ScorerConfig(
-        views, config.goal, config.embedder, config.features, config.similarity, config.precision
+        views,
+        config.goal,
+        config.embedder,
+        config.features,
+        config.similarity,
+        config.precision,
+        config.goal_share,
     )
     with ui.progress("rendering and embedding", 100) as advance:
         shown = 0
@@ -74,6 +84,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
             config.dataset,
             scorer_config,
             reward=config.reward,
+            shuffle=config.shuffle,
             device=config.device,
             n_workers=config.n_workers,
             on_progress=on_progress,

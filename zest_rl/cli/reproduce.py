@@ -1,40 +1,27 @@
-"""``zest reproduce``: a recipe → collected and relabeled datasets, trained and evaluated methods, table and report.
+"""``zest reproduce``: a recipe → collected and relabeled datasets, trained and evaluated methods, tables and reports.
 
-A recipe has these tables (keys are the flags of the verb)::
-
-    title = "…"
-    seeds = [0, 1, 2]               training seeds, one cell per method and seed
-    caveats = ["…"]                 sentences at the end of the report
-    [collect]                       `zest collect`
-    [relabel]                       `zest relabel`, for all goals
-    [goals.NAME]                    `zest relabel`, for this goal
-    [train]                         `zest train`, for all methods
-    [methods."NAME"]                agent = "dt", goal = "NAME" (left out: ground-truth rewards), kind, note, paper,
-                                    and the agent's own flags
-    [evaluate]                      `zest evaluate`
-
-Cells run side by side, one core each; a finished cell is never run again.
+What a recipe may hold is drawn in `zest_rl.cli.plans`. Cells run side by side, one core each; a finished cell is never
+run again.
 """
 
 from __future__ import annotations
 
 import math
-import re
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from zest_rl.cli.plans import Cell, Plan, TaskData, plan_cells, read_plan
 from zest_rl.cli.ui import SilentUi, Ui
-from zest_rl.errors import BadInput, nearest
 
 if TYPE_CHECKING:
-    from zest_rl.evaluation import EvaluationConfig
+    from zest_rl.comparison import Method
+    from zest_rl.report import MethodRow, Report
 
 POLL_SECONDS = 2.0
 
@@ -46,135 +33,69 @@ class Config:
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECIPE.toml")]
     """Recipe, e.g. eval/demo.toml."""
     output: Path | None = None
-    """Folder of runs, result.json and report.html; default runs/RECIPE."""
+    """Folder of runs, result.json, table.md and report.html; default runs/RECIPE."""
     n_workers: int | None = None
     """Cells side by side; default one per core."""
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """The keys and tables of a recipe; what stands in a table is checked by the config of its verb."""
-
-    title: str
-    collect: dict[str, Any]
-    methods: dict[str, dict[str, Any]]
-    seeds: tuple[int, ...] = (0,)
-    caveats: tuple[str, ...] = ()
-    paper_demo: float | None = None
-    relabel: dict[str, Any] = field(default_factory=dict)
-    goals: dict[str, dict[str, Any]] = field(default_factory=dict)
-    train: dict[str, Any] = field(default_factory=dict)
-    evaluate: dict[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if not self.methods:
-            raise BadInput("methods needs at least 1 method")
-        if not self.seeds or min(self.seeds) < 0 or len(set(self.seeds)) < len(self.seeds):
-            raise BadInput(f"seeds must be at least 1 number, all different and none negative, got {list(self.seeds)}")
-
-
-@dataclass(frozen=True)
-class Entry:
-    """What the table of a method says besides the agent's own flags."""
-
-    agent: str
-    goal: str | None = None
-    kind: Literal["method", "control"] = "method"
-    note: str = ""
-    paper: float | None = None
-
-
-@dataclass(frozen=True)
-class Plan:
-    """A recipe, read and checked as a whole before anything runs."""
-
-    recipe: Recipe
-    collect: Any
-    """Config of `zest collect`."""
-    goals: Mapping[str, Any]
-    """Name → config of `zest relabel`."""
-    methods: Mapping[str, Entry]
-    training: Mapping[str, Mapping[str, Any]]
-    """Method → arguments of `zest train AGENT`; dataset and seed are added per cell."""
-    evaluation: EvaluationConfig
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One method with one training seed."""
-
-    method: str
-    run: Path
-    agent: str
-    train: Mapping[str, Any]
-    """Arguments of `zest train AGENT`."""
-    evaluate: Mapping[str, Any]
-    """Arguments of `zest evaluate`."""
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Run all stages that are not done yet."""
     from zest_rl import artifacts
-    from zest_rl.cli import collect, relabel
-    from zest_rl.comparison import Method, compare
+    from zest_rl.comparison import overview
     from zest_rl.report import write_report
 
     started = time.monotonic()
     plan = read_plan(config.file)
     output = config.output or Path("runs") / config.file.stem
-    ui.say(f"[1/4] collect → {plan.collect.task}")
-    collected = collect.run(replace(plan.collect, n_workers=config.n_workers), ui)
-    source = collected["dataset"]
-    datasets: dict[str, str] = {}
-    for name, goal in plan.goals.items():
-        ui.say(f"[2/4] relabel by goal {name!r}")
-        relabeled = relabel.run(replace(goal, dataset=source, n_workers=config.n_workers), ui)
-        datasets[name] = relabeled["dataset"]
-    cells = plan_cells(plan, source, datasets, output)
+    collected, datasets = {}, {}
+    for task, collect_config in plan.collect.items():
+        collected[task], datasets[task] = _make_datasets(plan, task, collect_config, config.n_workers, ui)
+    cells = plan_cells(plan, datasets, output)
     ui.say(f"[3/4] train and evaluate {len(cells)} cells in {output / 'cells'}")
-    n_run = run_cells(cells, plan.evaluation, output, ui, n_workers=config.n_workers)
+    n_run = run_cells(cells, output, ui, n_workers=config.n_workers)
     ui.say("[4/4] report")
-    methods = [
-        Method(name, tuple(cell.run for cell in cells if cell.method == name), entry.kind, entry.note, entry.paper)
-        for name, entry in plan.methods.items()
-    ]
-    report = compare(
-        plan.recipe.title,
-        methods,
-        source_id=source,
-        goals=datasets,
-        config=plan.evaluation,
-        paper_demo=plan.recipe.paper_demo,
-        caveats=plan.recipe.caveats,
-        details={"recipe": {"file": config.file.name, **asdict(plan.recipe)}, "collected": collected},
-    )
+    details = {"recipe": {"file": config.file.name, **asdict(plan.recipe)}}
+    reports = {
+        task: _task_report(plan, task, cells, datasets[task], {**details, "collected": collected[task]})
+        for task in datasets
+    }
+    if len(reports) == 1:
+        (report,) = reports.values()
+    else:
+        pages = {task: write_report(page, output / f"{task}.html").name for task, page in reports.items()}
+        sources = [of_task.source for of_task in datasets.values()]
+        report = overview(
+            plan.recipe.title,
+            {task: _methods(plan, cells, task) for task in datasets},
+            reports,
+            pages,
+            sources=sources,
+            paper_demo=plan.recipe.paper_demo,
+            caveats=plan.recipe.caveats,
+            details=details,
+        )
     html = write_report(report, output / "report.html")
     result = {
-        "rows": {
-            row.method: {
-                "normalized_return": row.mean,
-                "ci95": [row.ci_low, row.ci_high],
-                "iqm": row.iqm,
-                "success": row.success_rate,
-                "n_seeds": row.n_seeds,
-                "n_episodes": row.n_episodes,
-                "paper": row.paper_value,
-                "kind": row.kind,
+        "rows": _rows(report.table),
+        "tasks": {
+            task: {
+                "rows": _rows(page.table),
+                "spearman_of_zest_and_true_returns": {
+                    scatter.name: None
+                    if math.isnan(scatter.spearman)
+                    else {"value": scatter.spearman, "ci95": scatter.ci}
+                    for scatter in page.scatters
+                },
+                "dataset": {key: value for key, value in collected[task].items() if key not in ("path", "next")},
             }
-            for row in report.table
-        },
-        "spearman_of_zest_and_true_returns": {
-            scatter.name: None if math.isnan(scatter.spearman) else {"value": scatter.spearman, "ci95": scatter.ci}
-            for scatter in report.scatters
-        },
-        "dataset": {
-            key: collected[key] for key in ("dataset", "n_episodes", "n_failed", "noise_max", "expert_success")
+            for task, page in reports.items()
         },
         "seeds": list(plan.recipe.seeds),
-        "seconds_by_cell": {cell.run.name: _seconds(cell) for cell in cells},
+        "seconds_by_cell": {cell.name: _seconds(cell, output) for cell in cells},
         "provenance": artifacts.provenance(),
     }
     artifacts.write_json(output / "result.json", result)
+    artifacts.write_bytes(output / "table.md", markdown(result).encode())
     if n_run == 0:
         ui.say("all cells were done already")
     return {
@@ -184,6 +105,66 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "n_cells_run": n_run,
         "seconds": round(time.monotonic() - started, 1),
         "next": f"open {html} in a browser",
+    }
+
+
+def _make_datasets(plan: Plan, task: str, collect_config: Any, n_workers: int | None, ui: Ui) -> tuple[Any, TaskData]:
+    """Collect and relabel; return the result of `zest collect` and the datasets."""
+    from zest_rl.cli import collect, relabel
+
+    ui.say(f"[1/4] collect {task}")
+    collected = collect.run(replace(collect_config, n_workers=n_workers), ui)
+    by_goal = {}
+    for name, goal in plan.goals.items():
+        ui.say(f"[2/4] relabel {task} by goal {name!r}")
+        relabeled = relabel.run(replace(goal, dataset=collected["dataset"], n_workers=n_workers), ui)
+        by_goal[name] = relabeled["dataset"]
+    return collected, TaskData(collected["dataset"], by_goal)
+
+
+def _methods(plan: Plan, cells: list[Cell], task: str) -> list[Method]:
+    from zest_rl.comparison import Method
+
+    return [
+        Method(
+            name,
+            tuple(cell.run for cell in cells if (cell.task, cell.method) == (task, name)),
+            method.entry.kind,
+            method.entry.note,
+            method.entry.paper,
+            method.evaluation,
+        )
+        for name, method in plan.methods.items()
+    ]
+
+
+def _task_report(plan: Plan, task: str, cells: list[Cell], datasets: TaskData, details: dict[str, Any]) -> Report:
+    from zest_rl.comparison import compare
+
+    return compare(
+        plan.recipe.title if len(plan.collect) == 1 else f"{plan.recipe.title}: {task}",
+        _methods(plan, cells, task),
+        source_id=datasets.source,
+        goals=dict(datasets.by_goal),
+        paper_demo=plan.recipe.paper_demo,
+        caveats=plan.recipe.caveats,
+        details=details,
+    )
+
+
+def _rows(table: tuple[MethodRow, ...]) -> dict[str, Any]:
+    return {
+        row.method: {
+            "normalized_return": row.mean,
+            "ci95": [row.ci_low, row.ci_high],
+            "iqm": row.iqm,
+            "success": row.success_rate,
+            "n_seeds": row.n_seeds,
+            "n_episodes": row.n_episodes,
+            "paper": row.paper_value,
+            "kind": row.kind,
+        }
+        for row in table
     }
 
 
@@ -199,103 +180,34 @@ def summary(result: Mapping[str, Any]) -> str:
             f"{name:<28}{row['normalized_return']:>12.2f}  {f'[{low:.2f}, {high:.2f}]':<18}{row['success']:>8.0%}"
             f"{row['n_seeds']:>7}{row['n_episodes']:>10}{paper:>8}"
         )
-    for name, rho in result["spearman_of_zest_and_true_returns"].items():
-        value = "undefined" if rho is None else f"{rho['value']:.3f}"
-        lines.append(f"goal {name}: Spearman ρ of ZeST and true returns {value}")
+    if len(result["tasks"]) > 1:
+        for task, of_task in result["tasks"].items():
+            figures = (f"{name} {row['normalized_return']:.1f}" for name, row in of_task["rows"].items())
+            lines.append(f"{task}: {', '.join(figures)}")
+    for task, of_task in result["tasks"].items():
+        for name, rho in of_task["spearman_of_zest_and_true_returns"].items():
+            value = "undefined" if rho is None else f"{rho['value']:.3f}"
+            lines.append(f"{task}, goal {name}: Spearman ρ of ZeST and true returns {value}")
     return "\n".join(
         [*lines, f"report: {result['report']}", f"{result['n_cells_run']} cells run, {result['seconds']} s"]
     )
 
 
-def read_plan(path: Path) -> Plan:
-    """Read a recipe and check all of it.
-
-    Raises:
-        BadInput: an unknown key, a missing table, a wrong type, a method that names no agent or an unknown goal.
-    """
-    from zest_rl.agents import get_agent
-    from zest_rl.cli import collect, evaluate, relabel, train
-    from zest_rl.cli.recipes import load_config, read_recipe
-
-    recipe = load_config(Recipe, read_recipe(path), f"recipe {path}")
-    goals = {}
-    for name, goal in recipe.goals.items():
-        where = f"recipe {path} [goals.{name!r}]"
-        table = {**_table(recipe.relabel, where, "dataset"), **_table(goal, where, "dataset"), "dataset": ""}
-        goals[name] = load_config(relabel.Config, table, where)
-    methods, training = {}, {}
-    for name, method in recipe.methods.items():
-        where = f"recipe {path} [methods.{name!r}]"
-        own = {key: value for key, value in method.items() if key in (f.name for f in fields(Entry))}
-        flags = {key: value for key, value in method.items() if key not in own}
-        methods[name] = entry = load_config(Entry, own, where)
-        with _at(where):
-            get_agent(entry.agent)
-        if entry.goal is not None and entry.goal not in goals:
-            raise BadInput(f"{where}: unknown goal {entry.goal!r}; {nearest(entry.goal, goals)}")
-        training[name] = {
-            "n_updates": 5000,
-            "threads": 1,
-            "device": "cpu",
-            **_table(recipe.train, where, "dataset", "seed", "run_dir"),
-            **_table(flags, where, "dataset", "seed", "run_dir"),
-        }
-        load_config(train.CONFIGS[entry.agent], {**training[name], "dataset": ""}, where)
-    where = f"recipe {path} [evaluate]"
-    evaluate_config = load_config(evaluate.Config, {**_table(recipe.evaluate, where, "run"), "run": ""}, where)
-    with _at(where):
-        evaluation = evaluate.settings(evaluate_config)
-    return Plan(
-        recipe=recipe,
-        collect=load_config(collect.Config, recipe.collect, f"recipe {path} [collect]"),
-        goals=goals,
-        methods=methods,
-        training=training,
-        evaluation=evaluation,
-    )
-
-
-@contextmanager
-def _at(where: str) -> Iterator[None]:
-    """Say in a refusal which part of the recipe it is about."""
-    try:
-        yield
-    except BadInput as error:
-        raise BadInput(f"{where}: {error}") from error
-
-
-def _table(values: Mapping[str, Any], where: str, *given: str) -> dict[str, Any]:
-    """Return a table with ``_`` for ``-`` in its keys; refuse those that `zest reproduce` itself gives."""
-    table = {key.replace("-", "_"): value for key, value in values.items()}
-    clash = sorted(table.keys() & set(given))
-    if clash:
-        raise BadInput(f"{where}: {', '.join(map(repr, clash))} is not for a recipe to set, it follows from the rest")
-    return table
-
-
-def plan_cells(plan: Plan, source: str, datasets: Mapping[str, str], output: Path) -> list[Cell]:
-    """Return one cell per method and seed; a cell's folder is named by a hash of all that it depends on."""
-    from zest_rl import artifacts, data
-
-    described = {dataset: data.describe(dataset) for dataset in {source, *datasets.values()}}
-    cells = []
-    for name, entry in plan.methods.items():
-        dataset = source if entry.goal is None else datasets[entry.goal]
-        for seed in plan.recipe.seeds:
-            table = {**plan.training[name], "dataset": dataset, "seed": seed}
-            identity = [table, entry.agent, plan.recipe.evaluate, described[dataset]]
-            slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
-            folder = output / "cells" / f"{slug}-seed{seed}-{artifacts.hash_json(identity)[:8]}"
-            cells.append(
-                Cell(
-                    name,
-                    folder,
-                    entry.agent,
-                    {**table, "run_dir": str(folder)},
-                    {"n_workers": 1, **plan.recipe.evaluate, "run": str(folder)},
-                )
-            )
-    return cells
+def markdown(result: Mapping[str, Any]) -> str:
+    """The table for a README: all tasks together, then one column per task."""
+    tasks = list(result["tasks"]) if len(result["tasks"]) > 1 else []
+    lines = [
+        "| | % of the expert | 95 % interval | " + "".join(f"{task} | " for task in tasks) + "paper |",
+        "|---|---|---|" + "---|" * (len(tasks) + 1),
+    ]
+    for name, row in result["rows"].items():
+        low, high = row["ci95"]
+        of_tasks = (f"{result['tasks'][task]['rows'][name]['normalized_return']:.1f} | " for task in tasks)
+        paper = "–" if row["paper"] is None else f"{row['paper']:.2f}"
+        lines.append(
+            f"| {name} | {row['normalized_return']:.2f} | {low:.1f} to {high:.1f} | {''.join(of_tasks)}{paper} |"
+        )
+    return "\n".join(lines) + "\n"
 
 
 def _work(cell: Cell) -> dict[str, Any]:
@@ -304,36 +216,33 @@ def _work(cell: Cell) -> dict[str, Any]:
     from zest_rl.cli import evaluate, train
     from zest_rl.cli.recipes import load_config
 
-    started = time.monotonic()
     train.run(load_config(train.CONFIGS[cell.agent], cell.train, cell.method), SilentUi())
     trained = time.monotonic()
     evaluate.run(load_config(evaluate.Config, cell.evaluate, cell.method), SilentUi())
-    return {"train_seconds": np.array(trained - started), "evaluate_seconds": np.array(time.monotonic() - trained)}
+    return {"evaluate_seconds": np.array(time.monotonic() - trained)}
 
 
-def run_cells(
-    cells: list[Cell], evaluation: EvaluationConfig, output: Path, ui: Ui, *, n_workers: int | None = None
-) -> int:
+def run_cells(cells: list[Cell], output: Path, ui: Ui, *, n_workers: int | None = None) -> int:
     """Train and evaluate all cells that are not done; return how many were not."""
     from zest_rl.parallel import map_jobs
 
     done_folder = output / "done"
-    open_cells = {cell.run.name: cell for cell in cells if not _is_done(cell, evaluation, done_folder)}
-    total = sum(cell.train["n_updates"] for cell in open_cells.values())
+    open_cells = {cell.name: cell for cell in cells if not _is_done(cell, done_folder)}
+    total = sum({cell.run: cell.train["n_updates"] for cell in open_cells.values()}.values())
     with (
         ui.progress("updates of all cells (evaluation follows)", total) as advance,
-        _TrainingWatch(list(open_cells.values()), advance),
+        _TrainingWatch({cell.run for cell in open_cells.values()}, advance),
     ):
         map_jobs(_work, open_cells, done_folder, n_workers=n_workers, on_done=lambda name: ui.say(f"done: {name}"))
     return len(open_cells)
 
 
-def _is_done(cell: Cell, evaluation: EvaluationConfig, folder: Path) -> bool:
+def _is_done(cell: Cell, folder: Path) -> bool:
     """Whether a cell's results are there; a marker without them is removed, so that the cell is run again."""
     from zest_rl.evaluation import evaluation_folder
 
-    marker = folder / f"{cell.run.name}.npz"
-    results = (cell.run / "meta.json", evaluation_folder(cell.run, evaluation) / "result.json")
+    marker = folder / f"{cell.name}.npz"
+    results = (cell.run / "meta.json", evaluation_folder(cell.run, cell.evaluation) / "result.json")
     if not all(path.exists() for path in results):
         marker.unlink(missing_ok=True)
     return marker.exists()
@@ -342,8 +251,8 @@ def _is_done(cell: Cell, evaluation: EvaluationConfig, folder: Path) -> bool:
 class _TrainingWatch:
     """Follow the training logs of cells that other processes work on."""
 
-    def __init__(self, cells: list[Cell], advance: Any) -> None:
-        self._cells, self._advance, self._shown = cells, advance, 0
+    def __init__(self, runs: set[Path], advance: Any) -> None:
+        self._runs, self._advance, self._shown = runs, advance, 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._follow, daemon=True)
 
@@ -360,7 +269,7 @@ class _TrainingWatch:
             self._show()
 
     def _show(self) -> None:
-        updates = sum(_updates_done(cell.run / "metrics.csv") for cell in self._cells)
+        updates = sum(_updates_done(run / "metrics.csv") for run in self._runs)
         if updates > self._shown:
             self._advance(updates - self._shown)
             self._shown = updates
@@ -374,8 +283,10 @@ def _updates_done(log: Path) -> int:
         return 0
 
 
-def _seconds(cell: Cell) -> dict[str, float]:
+def _seconds(cell: Cell, output: Path) -> dict[str, float]:
+    from zest_rl import artifacts
     from zest_rl.parallel import read_arrays
 
-    times = read_arrays(cell.run.parent.parent / "done" / f"{cell.run.name}.npz") or {}
+    times = {"train_seconds": artifacts.read_json(cell.run / "meta.json")["train_seconds"]}
+    times |= read_arrays(output / "done" / f"{cell.name}.npz") or {}
     return {name: round(float(value), 1) for name, value in times.items()}

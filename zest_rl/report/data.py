@@ -152,12 +152,23 @@ class Curve:
 
 
 @dataclass(frozen=True)
+class Section:
+    """The table of one task within a report over several."""
+
+    title: str
+    table: tuple[MethodRow, ...]
+    page: str
+    """File name, beside the report, of the task's own report."""
+
+
+@dataclass(frozen=True)
 class Report:
     """Everything one HTML file shows. Empty sections are left out."""
 
     title: str
     summary_sentence: str
     table: tuple[MethodRow, ...] = ()
+    sections: tuple[Section, ...] = ()
     goals: tuple[GoalPanel, ...] = ()
     episodes: tuple[EpisodePanel, ...] = ()
     scatters: tuple[Scatter, ...] = ()

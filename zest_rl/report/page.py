@@ -222,6 +222,13 @@ def _sections(report: Report) -> list[tuple[str, str, str]]:
     if report.table:
         intro = "100 % is the expert, 0 % is the robot that does nothing. Lines are 95 % bootstrap intervals."
         sections.append(("Results", intro, _table(report.table)))
+    if report.sections:
+        intro = "Each task on its own; its page has the goals, the episodes' videos and all settings."
+        body = "".join(
+            f'<h3><a href="{escape(section.page)}">{escape(section.title)}</a></h3>{_table(section.table)}'
+            for section in report.sections
+        )
+        sections.append(("Tasks", intro, body))
     if report.caveats:
         items = "".join(f"<li>{escape(caveat)}</li>" for caveat in report.caveats)
         sections.append(("Caveats", "", f'<ul class="caveats">{items}</ul>'))

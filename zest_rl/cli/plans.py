@@ -1,0 +1,239 @@
+"""Recipes of ``zest reproduce``, read, checked as a whole, and laid out as cells: task × method × training seed.
+
+A recipe has these tables (keys are the flags of the verb)::
+
+    title = "…"
+    seeds = [0, 1, 2]               training seeds, one cell per task, method and seed
+    caveats = ["…"]                 sentences at the end of the report
+    [collect]                       `zest collect`, for all tasks
+    [tasks.NAME]                    `zest collect`, for this task; left out: the one task of [collect]
+    [relabel]                       `zest relabel`, for all goals
+    [goals.NAME]                    `zest relabel`, for this goal
+    [train]                         `zest train`, for all methods
+    [evaluate]                      `zest evaluate`, for all methods
+    [methods."NAME"]                agent = "dt", goal = "NAME" (left out: ground-truth rewards), kind, note, paper,
+                                    evaluate = {…} of this method alone, and the agent's own flags
+
+Methods that differ in their evaluation alone share their trained policies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from zest_rl.errors import BadInput, nearest
+from zest_rl.tasks import get_task
+
+if TYPE_CHECKING:
+    from zest_rl.evaluation import EvaluationConfig
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The keys and tables of a recipe; what stands in a table is checked by the config of its verb."""
+
+    title: str
+    collect: dict[str, Any]
+    methods: dict[str, dict[str, Any]]
+    seeds: tuple[int, ...] = (0,)
+    caveats: tuple[str, ...] = ()
+    paper_demo: float | None = None
+    tasks: dict[str, dict[str, Any]] = field(default_factory=dict)
+    relabel: dict[str, Any] = field(default_factory=dict)
+    goals: dict[str, dict[str, Any]] = field(default_factory=dict)
+    train: dict[str, Any] = field(default_factory=dict)
+    evaluate: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.methods:
+            raise BadInput("methods needs at least 1 method")
+        if not self.seeds or min(self.seeds) < 0 or len(set(self.seeds)) < len(self.seeds):
+            raise BadInput(f"seeds must be at least 1 number, all different and none negative, got {list(self.seeds)}")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What the table of a method says besides the agent's own flags."""
+
+    agent: str
+    goal: str | None = None
+    kind: Literal["method", "control"] = "method"
+    note: str = ""
+    paper: float | None = None
+    evaluate: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PlannedMethod:
+    """One row of the table to be."""
+
+    entry: Entry
+    training: Mapping[str, Any]
+    """Arguments of `zest train AGENT`; dataset and seed are added per cell."""
+    evaluate: Mapping[str, Any]
+    """Arguments of `zest evaluate`; the run is added per cell."""
+    evaluation: EvaluationConfig
+    """What these arguments mean."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A recipe, read and checked as a whole before anything runs."""
+
+    recipe: Recipe
+    collect: Mapping[str, Any]
+    """Task → config of `zest collect`."""
+    goals: Mapping[str, Any]
+    """Name → config of `zest relabel`."""
+    methods: Mapping[str, PlannedMethod]
+
+
+@dataclass(frozen=True)
+class TaskData:
+    """The datasets of one task."""
+
+    source: str
+    """The collected one."""
+    by_goal: Mapping[str, str]
+    """Goal → the one relabeled by it."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One method on one task with one training seed."""
+
+    task: str
+    method: str
+    run: Path
+    agent: str
+    train: Mapping[str, Any]
+    """Arguments of `zest train AGENT`."""
+    evaluate: Mapping[str, Any]
+    """Arguments of `zest evaluate`."""
+    evaluation: EvaluationConfig
+
+    @property
+    def name(self) -> str:
+        """Name of the marker that says that it is done."""
+        from zest_rl.evaluation import evaluation_folder
+
+        return f"{self.run.name}-{evaluation_folder(self.run, self.evaluation).name}"
+
+
+def read_plan(path: Path) -> Plan:
+    """Read a recipe and check all of it.
+
+    Raises:
+        BadInput: an unknown key, a missing table, a wrong type, a method that names no agent or an unknown goal.
+    """
+    from zest_rl.cli import relabel
+    from zest_rl.cli.recipes import load_config, read_recipe
+
+    recipe = load_config(Recipe, read_recipe(path), f"recipe {path}")
+    goals = {}
+    for name, goal in recipe.goals.items():
+        where = f"recipe {path} [goals.{name!r}]"
+        table = {**_table(recipe.relabel, where, "dataset"), **_table(goal, where, "dataset"), "dataset": ""}
+        goals[name] = load_config(relabel.Config, table, where)
+    methods = {
+        name: _plan_method(recipe, method, goals, f"recipe {path} [methods.{name!r}]")
+        for name, method in recipe.methods.items()
+    }
+    return Plan(recipe, _plan_tasks(recipe, f"recipe {path}"), goals, methods)
+
+
+def _plan_tasks(recipe: Recipe, where: str) -> dict[str, Any]:
+    from zest_rl.cli.collect import Config
+    from zest_rl.cli.recipes import load_config
+
+    if not recipe.tasks:
+        collected = [load_config(Config, recipe.collect, f"{where} [collect]")]
+    else:
+        shared = _table(recipe.collect, f"{where} [collect]", "task")
+        collected = []
+        for task, table in recipe.tasks.items():
+            here = f"{where} [tasks.{task}]"
+            collected.append(load_config(Config, {**shared, **_table(table, here, "task"), "task": task}, here))
+    for config in collected:
+        with _at(f"{where} [{'tasks' if recipe.tasks else 'collect'}]"):
+            get_task(config.task)
+    return {config.task: config for config in collected}
+
+
+def _plan_method(recipe: Recipe, method: Mapping[str, Any], goals: Mapping[str, Any], where: str) -> PlannedMethod:
+    from zest_rl.agents import get_agent
+    from zest_rl.cli import evaluate, train
+    from zest_rl.cli.recipes import load_config
+
+    own = {key: value for key, value in method.items() if key in (f.name for f in fields(Entry))}
+    flags = {key: value for key, value in method.items() if key not in own}
+    entry = load_config(Entry, own, where)
+    with _at(where):
+        get_agent(entry.agent)
+    if entry.goal is not None and entry.goal not in goals:
+        raise BadInput(f"{where}: unknown goal {entry.goal!r}; {nearest(entry.goal, goals)}")
+    training = {
+        "n_updates": 5000,
+        "threads": 1,
+        "device": "cpu",
+        **_table(recipe.train, where, "dataset", "seed", "run_dir"),
+        **_table(flags, where, "dataset", "seed", "run_dir"),
+    }
+    load_config(train.CONFIGS[entry.agent], {**training, "dataset": ""}, where)
+    arguments = {**_table(recipe.evaluate, where, "run"), **_table(entry.evaluate, where, "run")}
+    config = load_config(evaluate.Config, {**arguments, "run": ""}, f"{where} [evaluate]")
+    with _at(f"{where} [evaluate]"):
+        evaluation = evaluate.settings(config)
+    return PlannedMethod(entry, training, {"n_workers": 1, **arguments}, evaluation)
+
+
+@contextmanager
+def _at(where: str) -> Iterator[None]:
+    """Say in a refusal which part of the recipe it is about."""
+    try:
+        yield
+    except BadInput as error:
+        raise BadInput(f"{where}: {error}") from error
+
+
+def _table(values: Mapping[str, Any], where: str, *given: str) -> dict[str, Any]:
+    """Return a table with ``_`` for ``-`` in its keys; refuse those that `zest reproduce` itself gives."""
+    table = {key.replace("-", "_"): value for key, value in values.items()}
+    clash = sorted(table.keys() & set(given))
+    if clash:
+        raise BadInput(f"{where}: {', '.join(map(repr, clash))} is not for a recipe to set, it follows from the rest")
+    return table
+
+
+def plan_cells(plan: Plan, datasets: Mapping[str, TaskData], output: Path) -> list[Cell]:
+    """Return one cell per task, method and seed; the run's folder is named by a hash of all that it depends on."""
+    from zest_rl import artifacts, data
+
+    described = {
+        name: data.describe(name) for task in datasets.values() for name in (task.source, *task.by_goal.values())
+    }
+    cells = []
+    for task, of_task in datasets.items():
+        for name, method in plan.methods.items():
+            goal, agent = method.entry.goal, method.entry.agent
+            dataset = of_task.source if goal is None else of_task.by_goal[goal]
+            for seed in plan.recipe.seeds:
+                table = {**method.training, "dataset": dataset, "seed": seed}
+                digest = artifacts.hash_json([table, agent, described[dataset]])
+                run = output / "cells" / f"{task}-{agent}-{goal or 'ground-truth'}-seed{seed}-{digest[:8]}"
+                cells.append(
+                    Cell(
+                        task,
+                        name,
+                        run,
+                        agent,
+                        {**table, "run_dir": str(run)},
+                        {**method.evaluate, "run": str(run)},
+                        method.evaluation,
+                    )
+                )
+    return cells
