@@ -134,6 +134,7 @@ def test_a_recipe_of_a_table_is_valid_and_found_from_anywhere(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ZEST_VISUAL_TASKS", str(tmp_path))
     plan = read_plan(Path("eval") / path.name)
     assert plan.recipe.title
     assert plan.methods.keys() == plan.recipe.methods.keys()

@@ -282,6 +282,18 @@ def test_a_level_that_is_no_share_of_the_expert_is_refused_before_any_episode(ta
         calibrate(NOISY, "noise_max", 7, SCALE, target)
 
 
+def test_calibration_stops_where_there_is_no_further_to_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    curve = Curve()
+    monkeypatch.setattr(collect, "run_behaviour", curve)
+    with pytest.raises(ZestError, match=r"the last try, 2\.0, gave 13\.5"):
+        calibrate(NOISY, "noise_max", 7, SCALE, 5.0)
+    assert [behaviour.noise_max for behaviour, _ in curve.asked] == [0.6, 1.2, 2.0]
+    curve.asked.clear()
+    with pytest.raises(ZestError, match=r"the last try, 0\.0, gave 5"):
+        calibrate(NOISY, "stop_share", 7, SCALE, 81.19)
+    assert len(curve.asked) == 1, "the noise alone is too much"
+
+
 def test_only_what_makes_the_expert_imperfect_can_be_calibrated() -> None:
     with pytest.raises(BadInput, match=r"'init_noise' cannot be calibrated; .*noise_max"):
         calibrate(NOISY, "init_noise", 7, SCALE, 50.0)
@@ -369,6 +381,10 @@ def test_the_command_typed_again_does_nothing_and_refuses_other_arguments(
     code, again, err = zest(WORDS)
     assert (code, again) == (0, result)
     assert f"{DATASET} is there already, nothing to do" in err
+    calibrated = ["calibrate" if word == "0.5" else word for word in WORDS]
+    level = str(result["normalized_return"]["value"])
+    assert zest([*calibrated, "--level", level])[:2] == (0, result), "it is what calibration to this level would give"
+    assert zest(calibrated)[0] == 2
     code, refused, _ = zest([*WORDS, "--seed", "1"])
     assert code == 2
     assert refused["error"]["type"] == "BadInput"

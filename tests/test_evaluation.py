@@ -250,7 +250,7 @@ def test_a_damaged_part_is_run_again_and_reading_it_says_so(trained: Path) -> No
     folder = evaluation_folder(trained / "bc-0", CONSTANT)
     (part,) = (folder / "parts").glob("*.npz")
     part.write_bytes(part.read_bytes()[:-100])
-    with pytest.raises(ZestError, match="missing or damaged; evaluate the run again"):
+    with pytest.raises(ZestError, match=r"missing or damaged \(seeds-.*\); run the command again"):
         read_evaluation(folder)
     assert_equal(evaluate(trained / "bc-0", CONSTANT, n_workers=1).traces, first.traces)
 
@@ -329,5 +329,5 @@ def test_result_json_tells_what_was_run_and_by_what(trained: Path) -> None:
     assert result["agent"] == "dt"
     assert result["references"] == {"minimum": 0.0, "expert": 70.0}
     assert [episode["seed"] for episode in result["episodes"]] == [11, 12]
-    assert all((folder / "parts" / name).exists() for name in result["parts"])
+    assert all((folder / "parts" / f"{name}.npz").exists() for name in result["parts"])
     assert result["provenance"]["versions"]["gymnasium"] == gymnasium.__version__

@@ -63,6 +63,9 @@ videos = false
 """
 
 
+TASK_AND_SIZE = 'task = "micro"\nn_episodes = 4'
+
+
 def write(folder: Path, text: str) -> Path:
     path = folder / "tiny.toml"
     path.write_text(text)
@@ -227,6 +230,11 @@ def test_whatever_a_result_depends_on_makes_a_cell_of_its_own(whole: Reproduced,
         ("[methods.BC]", "[methods]", "'methods' must be a table of tables"),
         ("[relabel]", "[tasks.micro]\n[relabel]", "[collect]: 'task' is not for a recipe to set"),
         ('task = "micro"', 'task = "mirco"', "[collect]: unknown task 'mirco'; did you mean 'micro'"),
+        ("noise_max = 1.0", "noise_max = 3.0", "[collect]: noise_max must be in [0, 2.0], got 3.0"),
+        ("n_episodes = 4", "n_episodes = 4\nlevel = 0", "level must be in (0, 100] percent of the expert, got 0.0"),
+        ('goal = "same-scene"', 'goal = "same-scen"', "[goals.'scene']: unknown goal 'same-scen'"),
+        ('goal = "same-scene"', 'goal = "visual-tasks:real_imgs"', "set it to your copy of the Visual Tasks Dataset"),
+        (TASK_AND_SIZE, "[tasks.micro]\nn_episodes = 3\n[tasks.sdoor]\nn_episodes = 4", "every task needs as many"),
         ("noise_max = 1.0", "noise-maxx = 1.0", "[collect]: unknown key 'noise-maxx'; did you mean 'noise-max'"),
         ("n_updates = 20", 'n_updates = "many"', "'n_updates' must be an integer, got 'many'"),
         ("hidden_size = 32", "hidden_size = 0", "hidden_size must be at least 1, got 0"),
@@ -250,6 +258,7 @@ def test_a_bad_recipe_is_refused_before_anything_runs(
 ) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("ZEST_VISUAL_TASKS", raising=False)
     assert RECIPE.count(old) == 1
     recipe = write(tmp_path, RECIPE.replace(old, new))
     code, message = refusal("reproduce", recipe, "--output", tmp_path / "out")

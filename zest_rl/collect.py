@@ -22,7 +22,7 @@ from zest_rl.data_writer import Recording
 from zest_rl.envs import ACT_DIM, ENV_ID, HORIZON
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.experts import DONE_PROGRESS, Manner, add_uniform_noise, make_expert
-from zest_rl.parallel import chunks, concatenate, map_jobs, read_arrays
+from zest_rl.parallel import chunks, concatenate, map_jobs, read_parts
 from zest_rl.types import FloatArray
 
 EPISODES_PER_JOB = 5
@@ -162,8 +162,7 @@ def run_behaviour(
         n_workers=n_workers,
         on_done=None if on_progress is None else lambda name: on_progress(len(jobs[name][1])),
     )
-    parts = [read_arrays(folder / f"{name}.npz") for name in jobs]
-    return concatenate([part for part in parts if part is not None])
+    return read_parts(folder, jobs)
 
 
 def behaviour_folder(behaviour: Behaviour) -> Path:
@@ -257,8 +256,11 @@ def calibrate(
         raise BadInput(f"the level to calibrate to must be in (0, 100] percent of the expert, got {target}")
     if knob not in LARGEST:
         raise BadInput(f"{knob!r} cannot be calibrated; {nearest(knob, LARGEST)}")
-    below, above = (0.0, 100.0), None  # (value, level) next to the target; a perfect expert is assumed at 0
-    value, level = 0.3 * LARGEST[knob], 100.0
+    below, above = (0.0, 100.0), None  # (value, level) next to the target
+    only_flaw = behaviour.with_value(knob, 0.0) == Behaviour(
+        behaviour.task, "expert", init_noise=behaviour.init_noise, seed=behaviour.seed
+    )
+    value = 0.3 * LARGEST[knob] if only_flaw else 0.0  # with no other flaw the level at 0 is the expert's
     for _ in range(n_rounds):
         tried = behaviour.with_value(knob, round(value, 4))
         episodes = run_behaviour(tried, n_episodes, n_workers=n_workers)
@@ -267,12 +269,14 @@ def calibrate(
             on_round(getattr(tried, knob), level)
         if abs(level - target) <= tolerance:
             return tried
+        if value == (LARGEST[knob] if level > target else 0.0):
+            break  # no further to go
         if level > target:
             below = (value, level)
         else:
             above = (value, level)
         if above is None:
-            value = min(2 * value, LARGEST[knob])
+            value = min(2 * value or 0.3 * LARGEST[knob], LARGEST[knob])
         else:
             share = (below[1] - target) / (below[1] - above[1]) if below[1] > above[1] else 0.5
             value = below[0] + np.clip(share, 0.1, 0.9) * (above[0] - below[0])

@@ -21,9 +21,9 @@ from zest_rl import artifacts
 from zest_rl.agents import Policy, load_policy
 from zest_rl.data import check_env_spec
 from zest_rl.envs import ENV_ID
-from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.errors import BadInput, nearest
 from zest_rl.metrics import bootstrap, iqm, normalized_return, wilson
-from zest_rl.parallel import chunks, concatenate, map_jobs, one_thread, read_arrays
+from zest_rl.parallel import chunks, map_jobs, one_thread, read_parts
 from zest_rl.relabel import SCORER_FILE, Reward
 from zest_rl.scorer import Scorer
 from zest_rl.types import EpisodeResult
@@ -261,8 +261,7 @@ def evaluate(
         n_workers=n_workers,
         on_done=None if on_progress is None else lambda name: on_progress(len(jobs[name][2])),
     )
-    parts = [read_arrays(folder / "parts" / f"{name}.npz") for name in jobs]
-    traces = concatenate([part for part in parts if part is not None])
+    traces = read_parts(folder / "parts", jobs)
     dataset = policy.meta["dataset"]
     result = Evaluation(
         run,
@@ -281,7 +280,7 @@ def evaluate(
             "references": {"minimum": result.minimum, "expert": result.expert},
             "summary": result.summary(),
             "episodes": [asdict(episode) for episode in result.episodes],
-            "parts": [f"{name}.npz" for name in jobs],
+            "parts": list(jobs),
             "provenance": artifacts.provenance(),
         },
     )
@@ -310,9 +309,6 @@ def read_evaluation(folder: Path) -> Evaluation:
     """
     result = artifacts.read_json(folder / "result.json")
     config = EvaluationConfig(**result["config"])
-    parts = [read_arrays(folder / "parts" / name) for name in result["parts"]]
-    if any(part is None for part in parts):
-        raise ZestError(f"parts of the evaluation {folder} are missing or damaged; evaluate the run again")
     return Evaluation(
         folder.parent.parent,
         config,
@@ -320,7 +316,7 @@ def read_evaluation(folder: Path) -> Evaluation:
         result["references"]["minimum"],
         result["references"]["expert"],
         tuple(EpisodeResult(**episode) for episode in result["episodes"]),
-        concatenate([part for part in parts if part is not None]),
+        read_parts(folder / "parts", result["parts"]),
     )
 
 

@@ -96,12 +96,28 @@ def read_text(spec: str) -> GoalSpec:
     return GoalSpec(spec, starts, goals)
 
 
-def drawings(task: Task) -> GoalSpec:
-    """Read the package's own drawings of a task.
+def goal_folder(spec: str, task: Task) -> Path | None:
+    """Return the folder with the pictures that a spec names; None for sentences and the scene itself.
 
     Raises:
-        BadInput: there are none for this task.
+        BadInput: there is no such folder, or the spec is none of the kinds.
     """
+    if spec == SAME_SCENE or spec.startswith(TEXT):
+        return None
+    if spec == DRAWINGS:
+        return _drawings(task)
+    if spec.startswith(VISUAL_TASKS):
+        return _visual_tasks(spec, task)
+    folder = Path(spec).expanduser()
+    if not folder.exists():
+        raise BadInput(
+            f"unknown goal {spec!r}: it is neither {SAME_SCENE!r}, {DRAWINGS!r}, '{VISUAL_TASKS}real_imgs', "
+            "'text:START -> GOAL', nor an existing folder with init/ and goal/"
+        )
+    return folder
+
+
+def _drawings(task: Task) -> Path:
     folder = artifacts.shipped("datasets") / "goals" / task.name
     if not folder.is_dir():
         drawn = sorted(p.name for p in folder.parent.iterdir() if p.is_dir()) if folder.parent.is_dir() else []
@@ -109,22 +125,17 @@ def drawings(task: Task) -> GoalSpec:
             f"there are no drawings of task {task.name!r} (only of {', '.join(drawn) or 'none'}); "
             "give a folder with init/ and goal/ instead"
         )
-    return read_folder(folder, DRAWINGS)
+    return folder
 
 
-def visual_tasks(spec: str, task: Task) -> GoalSpec:
-    """Read a task's folder of the Visual Tasks Dataset.
-
-    Raises:
-        BadInput: the environment variable does not point to the dataset, or it has no such folder.
-    """
+def _visual_tasks(spec: str, task: Task) -> Path:
     root = os.environ.get(VISUAL_TASKS_VARIABLE)
     if not root:
         raise BadInput(
             f"goal {spec!r} needs the environment variable {VISUAL_TASKS_VARIABLE}: set it to your copy of the Visual "
             "Tasks Dataset (the folder that holds real_imgs/ and drawings/)"
         )
-    return read_folder(Path(root) / spec.removeprefix(VISUAL_TASKS) / task.goal_folder, spec)
+    return Path(root) / spec.removeprefix(VISUAL_TASKS) / task.goal_folder
 
 
 def read_goal(spec: str, task: Task, scene: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None = None) -> GoalSpec:
@@ -142,19 +153,8 @@ def read_goal(spec: str, task: Task, scene: tuple[NDArray[np.uint8], NDArray[np.
         if scene is None:
             raise BadInput(f"goal {SAME_SCENE!r} needs frames of the scene")
         return GoalSpec(spec, tuple(scene[0]), tuple(scene[1]), per_view=True)
-    if spec == DRAWINGS:
-        return drawings(task)
-    if spec.startswith(TEXT):
-        return read_text(spec)
-    if spec.startswith(VISUAL_TASKS):
-        return visual_tasks(spec, task)
-    folder = Path(spec).expanduser()
-    if not folder.exists():
-        raise BadInput(
-            f"unknown goal {spec!r}: it is neither {SAME_SCENE!r}, {DRAWINGS!r}, '{VISUAL_TASKS}real_imgs', "
-            "'text:START -> GOAL', nor an existing folder with init/ and goal/"
-        )
-    return read_folder(folder, spec)
+    folder = goal_folder(spec, task)
+    return read_text(spec) if folder is None else read_folder(folder, spec)
 
 
 def embed_goal(goal: GoalSpec, embedder: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -12,7 +12,8 @@ from zest_rl.errors import BadInput
 
 Values = NDArray[np.float64]
 Statistic = Callable[[Values], Values]
-N_RESAMPLES = 10_000
+N_RESAMPLES, BLOCK = 10_000, 200
+"""Bootstrap samples, and how many are in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -76,10 +77,12 @@ def bootstrap(
     rng = np.random.default_rng(seed)
     task = np.arange(n_tasks)[:, None, None]
     samples = []
-    for _ in range(n_resamples):
-        chosen = rng.integers(n_seeds, size=(n_tasks, n_seeds, 1))
-        samples.append(values[task, chosen, rng.integers(n, size=values.shape)].ravel())
-    low, high = np.quantile(statistic(np.stack(samples)), [0.025, 0.975])
+    for start in range(0, n_resamples, BLOCK):
+        size = min(BLOCK, n_resamples - start)
+        chosen = rng.integers(n_seeds, size=(size, n_tasks, n_seeds, 1))
+        picked = values[task, chosen, rng.integers(n, size=(size, *values.shape))]
+        samples.append(statistic(picked.reshape(size, -1)))
+    low, high = np.quantile(np.concatenate(samples), [0.025, 0.975])
     return Estimate(float(statistic(values.ravel())), float(low), float(high))
 
 

@@ -8,7 +8,7 @@ import sys
 import threading
 import zipfile
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -26,6 +26,7 @@ from zest_rl.errors import BadInput, ZestError
 
 Job = TypeVar("Job")
 Arrays = Mapping[str, NDArray[Any]]
+_STARTING = threading.Lock()
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -54,18 +55,19 @@ def starting_children() -> Iterator[None]:
     the child, as the libraries read it when they are loaded. A spawned process would import ``__main__``, which hangs
     when a script does its work there without ``if __name__ == "__main__"``; what we send it needs no such import.
     """
-    main, before = sys.modules["__main__"], {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = main
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+    with _STARTING:
+        main, before = sys.modules["__main__"], {name: os.environ.get(name) for name in THREAD_VARIABLES}
+        os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = main
+            for name, value in before.items():
+                if value is None:
+                    del os.environ[name]
+                else:
+                    os.environ[name] = value
 
 
 @contextmanager
@@ -156,7 +158,10 @@ def map_jobs(
         except BrokenProcessPool as error:
             finished.put((name, error))
 
+    all_started = threading.Event()
+
     def go_on(name: str, future: Future[None]) -> None:
+        all_started.wait()  # a process that is started from here would be outside of `starting_children`
         if future.exception() is None:
             submit()
         finished.put((name, future.exception()))
@@ -166,6 +171,7 @@ def map_jobs(
         with starting_children():  # submitting starts them
             for _ in range(n_workers - 1):
                 submit()
+        all_started.set()
         try:
             for _ in missing:
                 while finished.empty() and work_here():
@@ -187,6 +193,20 @@ def map_jobs(
 def chunks(n: int, size: int) -> list[range]:
     """Split ``range(n)`` into ranges of at most `size`."""
     return [range(start, min(start + size, n)) for start in range(0, n, size)]
+
+
+def read_parts(folder: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """Join what `map_jobs` left for these jobs along the first axis.
+
+    Raises:
+        ZestError: a part is missing or damaged.
+    """
+    parts = {name: read_arrays(folder / f"{name}.npz") for name in names}
+    found = [part for part in parts.values() if part is not None]
+    if len(found) < len(parts):
+        gone = [name for name, part in parts.items() if part is None]
+        raise ZestError(f"parts of {folder} are missing or damaged ({', '.join(gone)}); run the command again")
+    return concatenate(found)
 
 
 def concatenate(parts: Sequence[Arrays]) -> dict[str, NDArray[Any]]:

@@ -55,14 +55,16 @@ def rewards_from_scores(scores: FloatArray, reward: Reward = "level") -> FloatAr
 
 
 def shuffled(scores: Sequence[FloatArray], seed: int) -> list[FloatArray]:
-    """Hand the scores of whole episodes to other episodes: a reward of the same shape that tells nothing.
+    """Give every episode the scores of another one: rewards of the same shape that tell nothing.
 
     Raises:
-        BadInput: the episodes are not equally long.
+        BadInput: there are fewer than 2 episodes, or they are not equally long.
     """
-    if len({len(score) for score in scores}) > 1:
-        raise BadInput("scores can be shuffled among equally long episodes only; leave --shuffle out for this dataset")
-    return [scores[i] for i in np.random.default_rng(seed).permutation(len(scores))]
+    if len(scores) < 2 or len({len(score) for score in scores}) > 1:
+        raise BadInput("scores can be shuffled among 2 or more equally long episodes only; leave --shuffle out")
+    order = np.random.default_rng(seed).permutation(len(scores))  # in a ring, so that none keeps its own
+    taken = dict(zip(order, np.roll(order, 1), strict=True))
+    return [scores[taken[i]] for i in range(len(scores))]
 
 
 def relabeled_id(source_id: str, digest: str) -> str:
@@ -102,12 +104,17 @@ def relabel(
     target_id = relabeled_id(source_id, digest)
     path = data.dataset_path(target_id)
     n_frames = sum(map(len, states))
-    there = Relabeled(target_id, path, scorer, n_frames, None, already_there=True)
+
+    def find() -> Relabeled:
+        """Return the dataset that is there already, with its own scorer: that one knows which goals were kept."""
+        its_scorer = Scorer.load(path / SCORER_FILE, device=device, n_workers=n_workers)
+        return Relabeled(target_id, path, its_scorer, n_frames, None, already_there=True)
+
     if data.exists(target_id):
-        return there
+        return find()
     with artifacts.lock(path):
         if data.exists(target_id):  # an equal call that ran at the same time
-            return there
+            return find()
         kept = scorer.select_goals(states, on_progress) if config.goal_share < 1 else None
         scores, n_still = scorer.score_episodes(states, on_progress)
         if shuffle is not None:

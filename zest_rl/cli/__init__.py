@@ -63,6 +63,8 @@ INTERRUPTED = 130
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``zest`` with `argv` (default: the process's own arguments) and return its exit code."""
+    # NumPy's threads beside busy workers make small products many times slower; it reads this when it is loaded
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     words = list(sys.argv[1:] if argv is None else argv)
     as_json = "--json" in words
     try:

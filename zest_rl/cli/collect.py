@@ -1,13 +1,19 @@
-"""``zest collect``: an expert with noise → a Minari dataset with successes and failures."""
+"""``zest collect``: an imperfect expert → a Minari dataset with successes and failures."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from zest_rl.cli.ui import Ui
 from zest_rl.errors import BadInput
 
+if TYPE_CHECKING:
+    from zest_rl.collect import Behaviour
+
+CALIBRATION_TOLERANCE = 0.5
+"""Percent of the expert."""
 FLAWS = ("noise_max", "stop_share", "slow_max", "bias_max", "grip_max")
 
 
@@ -41,10 +47,28 @@ class Config:
     def __post_init__(self) -> None:
         if self.n_episodes < 1:
             raise BadInput(f"n-episodes must be at least 1, got {self.n_episodes}")
+        if not 0 < self.level <= 100:
+            raise BadInput(f"level must be in (0, 100] percent of the expert, got {self.level}")
         if len(self.calibrated) > 1:
             raise BadInput(
                 f"one number can be calibrated, got {' and '.join(self.calibrated)}; give the others a value"
             )
+
+    @property
+    def dataset_id(self) -> str:
+        """Id of the dataset of this task."""
+        return self.dataset.replace("{task}", self.task)
+
+    def behaviour(self) -> Behaviour:
+        """Return what acts; a number that is to be calibrated is still 0.
+
+        Raises:
+            BadInput: a number is out of range.
+        """
+        from zest_rl.collect import Behaviour
+
+        given = {name: value for name, value in self.flaws.items() if value != "calibrate"}
+        return Behaviour(self.task, "expert", seed=self.seed, **given)
 
     @property
     def flaws(self) -> dict[str, float | Literal["calibrate"]]:
@@ -69,12 +93,12 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     from zest_rl.tasks import get_task
 
     get_task(config.task)
-    dataset_id = config.dataset.replace("{task}", config.task)
+    dataset_id = config.dataset_id
     asked = {key: value for key, value in asdict(config).items() if key not in ("dataset", "n_workers")}
     path = data.dataset_path(dataset_id)
     if data.exists(dataset_id):
         made_by = data.read_metadata(dataset_id).get("zest", {}).get("collect", {})
-        if made_by.get("asked") != asked:
+        if not _is_same(asked, made_by):
             raise BadInput(
                 f"dataset {dataset_id} exists and was collected with other arguments ({made_by.get('asked')}); "
                 f"choose another id with --dataset, or delete {path}"
@@ -82,8 +106,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         ui.say(f"{dataset_id} is there already, nothing to do")
         return {**made_by["result"], "dataset": dataset_id, "path": str(path), "next": _next(dataset_id)}
 
-    given = {name: value for name, value in config.flaws.items() if value != "calibrate"}
-    behaviour = collect.Behaviour(config.task, "expert", seed=config.seed, **given)
+    behaviour = config.behaviour()
     n_reference = collect.N_REFERENCE
     with ui.progress("reference returns (expert, doing nothing)", n_reference + collect.N_NOTHING) as advance:
         references = collect.measure_references(behaviour, n_reference, n_workers=config.n_workers, on_progress=advance)
@@ -96,6 +119,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
             config.n_episodes,
             references,
             config.level,
+            tolerance=CALIBRATION_TOLERANCE,
             n_workers=config.n_workers,
             on_round=lambda value, level: ui.say(f"{knob} {value:.4f}: {level:.2f} % of the expert"),
         )
@@ -121,12 +145,28 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         ref_max_score=references.expert,
         algorithm_name="imperfect scripted expert",
         description=f"Kitchen task {config.task}: {config.n_episodes} episodes of 100 steps by a scripted expert with "
-        + ", ".join(f"{name} {value}" for name in FLAWS if (value := getattr(behaviour, name)))
+        + (", ".join(f"{name} {value}" for name in FLAWS if (value := getattr(behaviour, name))) or "no flaws")
         + " (drawn per episode, see zest_rl.collect.Behaviour).",
         zest={"collect": {"asked": asked, "result": result, "provenance": artifacts.provenance()}},
     )
     shutil.rmtree(collect.behaviour_folder(behaviour), ignore_errors=True)
     return {**result, "dataset": dataset_id, "path": str(path), "next": _next(dataset_id)}
+
+
+def _is_same(asked: Mapping[str, Any], made_by: Mapping[str, Any]) -> bool:
+    """Whether a dataset is what is asked for; a number that calibration found is as good as the same number given."""
+    if not made_by:
+        return False
+    found = {name: made_by["result"][name] for name in FLAWS}
+    calibrated = any(asked[name] == "calibrate" for name in FLAWS)
+    off_by = abs(made_by["result"]["normalized_return"]["value"] - asked["level"])
+    wanted = {name: found[name] if asked[name] == "calibrate" else asked[name] for name in FLAWS}
+    ignored = {**dict.fromkeys(FLAWS), "level": None}
+    return (
+        {**asked, **ignored} == {**made_by["asked"], **ignored}
+        and wanted == found
+        and (not calibrated or off_by <= CALIBRATION_TOLERANCE)
+    )
 
 
 def _next(dataset_id: str) -> str:

@@ -119,9 +119,9 @@ class Cell:
     @property
     def name(self) -> str:
         """Name of the marker that says that it is done."""
-        from zest_rl.evaluation import evaluation_folder
+        from zest_rl.artifacts import hash_json
 
-        return f"{self.run.name}-{evaluation_folder(self.run, self.evaluation).name}"
+        return f"{self.run.name}-{hash_json({**self.evaluate, 'run': '', 'n_workers': 1})[:8]}"
 
 
 def read_plan(path: Path) -> Plan:
@@ -132,6 +132,7 @@ def read_plan(path: Path) -> Plan:
     """
     from zest_rl.cli import relabel
     from zest_rl.cli.recipes import load_config, read_recipe
+    from zest_rl.goals import goal_folder
 
     recipe = load_config(Recipe, read_recipe(path), f"recipe {path}")
     goals = {}
@@ -143,7 +144,12 @@ def read_plan(path: Path) -> Plan:
         name: _plan_method(recipe, method, goals, f"recipe {path} [methods.{name!r}]")
         for name, method in recipe.methods.items()
     }
-    return Plan(recipe, _plan_tasks(recipe, f"recipe {path}"), goals, methods)
+    collected = _plan_tasks(recipe, f"recipe {path}")
+    for name, config in goals.items():
+        for task in collected:
+            with _at(f"recipe {path} [goals.{name!r}]"):
+                goal_folder(config.goal, get_task(task))
+    return Plan(recipe, collected, goals, methods)
 
 
 def _plan_tasks(recipe: Recipe, where: str) -> dict[str, Any]:
@@ -158,9 +164,16 @@ def _plan_tasks(recipe: Recipe, where: str) -> dict[str, Any]:
         for task, table in recipe.tasks.items():
             here = f"{where} [tasks.{task}]"
             collected.append(load_config(Config, {**shared, **_table(table, here, "task"), "task": task}, here))
+    sizes, ids = {config.n_episodes for config in collected}, {config.dataset_id for config in collected}
+    if len(sizes) > 1 or len(ids) < len(collected):
+        raise BadInput(
+            f"{where} [tasks]: every task needs as many episodes and a dataset of its own, got n_episodes "
+            f"{sorted(sizes)} and datasets {sorted(ids)}; let the dataset's id in [collect] hold {{task}}"
+        )
     for config in collected:
         with _at(f"{where} [{'tasks' if recipe.tasks else 'collect'}]"):
             get_task(config.task)
+            config.behaviour()
     return {config.task: config for config in collected}
 
 
@@ -210,7 +223,7 @@ def _table(values: Mapping[str, Any], where: str, *given: str) -> dict[str, Any]
 
 
 def plan_cells(plan: Plan, datasets: Mapping[str, TaskData], output: Path) -> list[Cell]:
-    """Return one cell per task, method and seed; the run's folder is named by a hash of all that it depends on."""
+    """Return one cell per task, method and seed; the run's folder is named by a hash of its data and arguments."""
     from zest_rl import artifacts, data
 
     described = {

@@ -86,7 +86,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
                     else {"value": scatter.spearman, "ci95": scatter.ci}
                     for scatter in page.scatters
                 },
-                "dataset": {key: value for key, value in collected[task].items() if key not in ("path", "next")},
+                "dataset": collected[task],
             }
             for task, page in reports.items()
         },
@@ -114,12 +114,13 @@ def _make_datasets(plan: Plan, task: str, collect_config: Any, n_workers: int | 
 
     ui.say(f"[1/4] collect {task}")
     collected = collect.run(replace(collect_config, n_workers=n_workers), ui)
+    made = {key: value for key, value in collected.items() if key not in ("path", "next")}
     by_goal = {}
     for name, goal in plan.goals.items():
         ui.say(f"[2/4] relabel {task} by goal {name!r}")
         relabeled = relabel.run(replace(goal, dataset=collected["dataset"], n_workers=n_workers), ui)
         by_goal[name] = relabeled["dataset"]
-    return collected, TaskData(collected["dataset"], by_goal)
+    return made, TaskData(collected["dataset"], by_goal)
 
 
 def _methods(plan: Plan, cells: list[Cell], task: str) -> list[Method]:

@@ -116,7 +116,7 @@ def load_embedder(
 
             return _place(build_lite0(weights), device, bf16)
 
-        fingerprint = hash_json([uri, hash_file(weights), LITE0_PREPROCESSING, bf16])
+        fingerprint = hash_json([uri, hash_file(weights), LITE0_PREPROCESSING, bf16, "batch norms folded"])
         return _NetworkEmbedder(uri, fingerprint, 1280, False, batch_size, load_lite0)
 
     from zest_rl.embedders.networks import build
