@@ -239,6 +239,11 @@ def test_an_error_of_a_worker_arrives_as_what_it_is(tmp_path: Path) -> None:
         map_jobs(refuse, SEEDS, tmp_path, n_workers=2)
 
 
+def test_work_that_cannot_be_sent_is_an_error_and_no_wait(tmp_path: Path) -> None:
+    with pytest.raises(Exception, match=r"(?i)pickle|local object"):
+        map_jobs(counted([]), SEEDS, tmp_path, n_workers=3)
+
+
 def test_workers_end_with_a_killed_command(tmp_path: Path) -> None:
     hearts = [tmp_path / "heart-0", tmp_path / "heart-1"]
     code = (

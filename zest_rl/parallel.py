@@ -161,8 +161,8 @@ def map_jobs(
     all_started = threading.Event()
 
     def go_on(name: str, future: Future[None]) -> None:
-        all_started.wait()  # a process that is started from here would be outside of `starting_children`
         if future.exception() is None:
+            all_started.wait()  # a process that is started from here would be outside of `starting_children`
             submit()
         finished.put((name, future.exception()))
 
