@@ -23,6 +23,7 @@ from zest_rl.envs import ACT_DIM, ENV_ID, HORIZON
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.experts import DONE_PROGRESS, Manner, add_uniform_noise, make_expert
 from zest_rl.parallel import chunks, concatenate, map_jobs, read_parts
+from zest_rl.tasks import get_task
 from zest_rl.types import FloatArray
 
 EPISODES_PER_JOB = 5
@@ -31,6 +32,8 @@ REFERENCE_STREAM = 2**31
 LARGEST = {"noise_max": 2.0, "stop_share": 1.0, "slow_max": 0.9, "bias_max": 1.0, "grip_max": 0.1}
 """Bounds of what makes an expert imperfect, and what can be calibrated."""
 STOP_BETWEEN = (0.1, 1.0)
+TOLERANCE = 0.5
+"""Percent of the expert within which a calibrated dataset meets its level."""
 N_REFERENCE = 100
 """Episodes that measure the expert."""
 N_NOTHING = 10
@@ -60,6 +63,7 @@ class Behaviour:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        get_task(self.task)
         for name, largest in LARGEST.items():
             if not 0 <= getattr(self, name) <= largest:
                 raise BadInput(f"{name} must be in [0, {largest}], got {getattr(self, name)}")
@@ -67,6 +71,11 @@ class Behaviour:
             raise BadInput(f"policy must be 'expert' or 'nothing', got {self.policy!r}")
         if self.seed < 0:
             raise BadInput(f"seed must be 0 or positive, got {self.seed}")
+
+    def without_flaws(self) -> Behaviour:
+        """Return the same starts, acted on as well as can be."""
+        values: dict[str, Any] = dict.fromkeys(LARGEST, 0.0)
+        return replace(self, **values)
 
     def with_value(self, knob: str, value: float) -> Behaviour:
         """Return this behaviour with another value of one of `LARGEST`."""
@@ -201,7 +210,7 @@ def measure_references(
     """
     runs = {
         policy: run_behaviour(
-            Behaviour(behaviour.task, policy, init_noise=behaviour.init_noise, seed=behaviour.seed),
+            replace(behaviour.without_flaws(), policy=policy),
             n,
             first=REFERENCE_STREAM,
             n_workers=n_workers,
@@ -227,7 +236,7 @@ def calibrate(
     references: References,
     target: float,
     *,
-    tolerance: float = 0.5,
+    tolerance: float = TOLERANCE,
     n_rounds: int = 12,
     n_workers: int | None = None,
     on_round: Callable[[float, float], None] | None = None,
@@ -257,9 +266,7 @@ def calibrate(
     if knob not in LARGEST:
         raise BadInput(f"{knob!r} cannot be calibrated; {nearest(knob, LARGEST)}")
     below, above = (0.0, 100.0), None  # (value, level) next to the target
-    only_flaw = behaviour.with_value(knob, 0.0) == Behaviour(
-        behaviour.task, "expert", init_noise=behaviour.init_noise, seed=behaviour.seed
-    )
+    only_flaw = behaviour.with_value(knob, 0.0) == behaviour.without_flaws()
     value = 0.3 * LARGEST[knob] if only_flaw else 0.0  # with no other flaw the level at 0 is the expert's
     for _ in range(n_rounds):
         tried = behaviour.with_value(knob, round(value, 4))

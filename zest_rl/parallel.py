@@ -137,21 +137,16 @@ def map_jobs(
     todo = deque(missing)
     finished: SimpleQueue[tuple[str, BaseException | None]] = SimpleQueue()
 
-    def work_here() -> bool:
-        """Do one job that no other process has begun; return False when there is none."""
+    def take() -> str | None:
+        """Return the next job that nobody has begun; other threads take from the same list."""
         try:
-            name = todo.popleft()
+            return todo.popleft()
         except IndexError:
-            return False
-        _run_job(work, jobs[name], paths[name])
-        finished.put((name, None))
-        return True
+            return None
 
     def submit() -> None:
         """Give the next job to another process, and when it is done another one, and so on."""
-        try:
-            name = todo.popleft()
-        except IndexError:
+        if (name := take()) is None:
             return
         try:
             pool.submit(_run_job, work, jobs[name], paths[name]).add_done_callback(partial(go_on, name))
@@ -174,8 +169,9 @@ def map_jobs(
         all_started.set()
         try:
             for _ in missing:
-                while finished.empty() and work_here():
-                    pass
+                if finished.empty() and (own := take()) is not None:
+                    _run_job(work, jobs[own], paths[own])
+                    finished.put((own, None))
                 name, error = finished.get()
                 if error is not None:
                     raise error

@@ -106,9 +106,11 @@ def relabel(
     n_frames = sum(map(len, states))
 
     def find() -> Relabeled:
-        """Return the dataset that is there already, with its own scorer: that one knows which goals were kept."""
-        its_scorer = Scorer.load(path / SCORER_FILE, device=device, n_workers=n_workers)
-        return Relabeled(target_id, path, its_scorer, n_frames, None, already_there=True)
+        """Return the dataset that is there already, and a scorer with the goals that it was scored by."""
+        kept = data.read_metadata(target_id)["zest"]["relabel"]["kept_goals"]
+        if kept is not None:
+            scorer.keep_goals(np.array(kept))
+        return Relabeled(target_id, path, scorer, n_frames, None, already_there=True)
 
     if data.exists(target_id):
         return find()

@@ -150,10 +150,14 @@ class Scorer:
                 goal = self.goals[..., k : k + 1, :]
                 best[k] += score_views(frames, self.starts, goal, self.config.features, self.config.similarity).max()
         kept = np.sort(np.argsort(-best, kind="stable")[:n_kept])
+        self.keep_goals(kept)
+        return kept
+
+    def keep_goals(self, kept: NDArray[np.intp]) -> None:
+        """Keep the goals with these indices and forget the others."""
         self.goals = self.goals[..., kept, :]
         if self.goal is not None and not self.goal.per_view:
             self.goal = replace(self.goal, goals=tuple(self.goal.goals[k] for k in kept))
-        return kept
 
     def _frames(
         self, states: Sequence[NDArray[np.float64]], on_progress: Callable[[int, int], None] | None

@@ -12,8 +12,6 @@ from zest_rl.errors import BadInput
 if TYPE_CHECKING:
     from zest_rl.collect import Behaviour
 
-CALIBRATION_TOLERANCE = 0.5
-"""Percent of the expert."""
 FLAWS = ("noise_max", "stop_share", "slow_max", "bias_max", "grip_max")
 
 
@@ -90,9 +88,8 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
     from zest_rl import artifacts, collect, data, metrics
     from zest_rl.data_writer import write_dataset
-    from zest_rl.tasks import get_task
 
-    get_task(config.task)
+    behaviour = config.behaviour()
     dataset_id = config.dataset_id
     asked = {key: value for key, value in asdict(config).items() if key not in ("dataset", "n_workers")}
     path = data.dataset_path(dataset_id)
@@ -106,7 +103,6 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         ui.say(f"{dataset_id} is there already, nothing to do")
         return {**made_by["result"], "dataset": dataset_id, "path": str(path), "next": _next(dataset_id)}
 
-    behaviour = config.behaviour()
     n_reference = collect.N_REFERENCE
     with ui.progress("reference returns (expert, doing nothing)", n_reference + collect.N_NOTHING) as advance:
         references = collect.measure_references(behaviour, n_reference, n_workers=config.n_workers, on_progress=advance)
@@ -119,7 +115,6 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
             config.n_episodes,
             references,
             config.level,
-            tolerance=CALIBRATION_TOLERANCE,
             n_workers=config.n_workers,
             on_round=lambda value, level: ui.say(f"{knob} {value:.4f}: {level:.2f} % of the expert"),
         )
@@ -155,6 +150,8 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
 def _is_same(asked: Mapping[str, Any], made_by: Mapping[str, Any]) -> bool:
     """Whether a dataset is what is asked for; a number that calibration found is as good as the same number given."""
+    from zest_rl.collect import TOLERANCE
+
     if not made_by:
         return False
     found = {name: made_by["result"][name] for name in FLAWS}
@@ -165,7 +162,7 @@ def _is_same(asked: Mapping[str, Any], made_by: Mapping[str, Any]) -> bool:
     return (
         {**asked, **ignored} == {**made_by["asked"], **ignored}
         and wanted == found
-        and (not calibrated or off_by <= CALIBRATION_TOLERANCE)
+        and (not calibrated or off_by <= TOLERANCE)
     )
 
 

@@ -172,7 +172,6 @@ def _plan_tasks(recipe: Recipe, where: str) -> dict[str, Any]:
         )
     for config in collected:
         with _at(f"{where} [{'tasks' if recipe.tasks else 'collect'}]"):
-            get_task(config.task)
             config.behaviour()
     return {config.task: config for config in collected}
 

@@ -55,8 +55,9 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     n_run = run_cells(cells, output, ui, n_workers=config.n_workers)
     ui.say("[4/4] report")
     details = {"recipe": {"file": config.file.name, **asdict(plan.recipe)}}
+    methods = {task: _methods(plan, cells, task) for task in datasets}
     reports = {
-        task: _task_report(plan, task, cells, datasets[task], {**details, "collected": collected[task]})
+        task: _task_report(plan, task, methods[task], datasets[task], {**details, "collected": collected[task]})
         for task in datasets
     }
     if len(reports) == 1:
@@ -66,7 +67,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         sources = [of_task.source for of_task in datasets.values()]
         report = overview(
             plan.recipe.title,
-            {task: _methods(plan, cells, task) for task in datasets},
+            methods,
             reports,
             pages,
             sources=sources,
@@ -139,12 +140,12 @@ def _methods(plan: Plan, cells: list[Cell], task: str) -> list[Method]:
     ]
 
 
-def _task_report(plan: Plan, task: str, cells: list[Cell], datasets: TaskData, details: dict[str, Any]) -> Report:
+def _task_report(plan: Plan, task: str, methods: list[Method], datasets: TaskData, details: dict[str, Any]) -> Report:
     from zest_rl.comparison import compare
 
     return compare(
         plan.recipe.title if len(plan.collect) == 1 else f"{plan.recipe.title}: {task}",
-        _methods(plan, cells, task),
+        methods,
         source_id=datasets.source,
         goals=dict(datasets.by_goal),
         paper_demo=plan.recipe.paper_demo,
