@@ -19,7 +19,7 @@ ORDER = (
     "load_order", "errors", "types", "artifacts", "parallel", "tasks", "data", "data_writer", "metrics", "envs",
     "arm", "experts", "collect",
     "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "relabel", "agents",
-    "training", "evaluation", "report", "comparison",
+    "checkpoints", "training", "evaluation", "report", "comparison",
     "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.train", "cli.evaluate",
     "cli.report", "cli.plans", "cli.reproduce",
 )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -78,24 +79,44 @@ def test_the_actions_of_one_episode_do_not_depend_on_the_others(run: Path) -> No
     np.testing.assert_allclose(play(policy, 8.0, n=1), play(policy, 8.0, n=7)[:1], atol=tolerance)
 
 
-def test_acting_sees_what_training_sees(run: Path) -> None:
-    """Step by step acting predicts what one pass over the same window predicts, here over the first K steps."""
-    policy = load_policy(run)
-    actions = play(policy, 8.0, n=2, steps=4, reward=1.0)
+@pytest.mark.parametrize("timesteps", ["absolute", "relative"])
+def test_acting_sees_what_training_sees(tmp_path: Path, timesteps: dt.Timesteps) -> None:
+    """Step by step acting predicts what one pass over the same window predicts, at each of 7 steps with K = 4."""
+    config = replace(SMALL, timesteps=timesteps)
+    folder = train("dt", config, two_behaviours(), tmp_path / "run", n_updates=20, seed=0, meta={}, threads=1)
+    policy = load_policy(folder)
+    actions = play(policy, 8.0, n=2, steps=7, reward=1.0)
     facts = describe_data(two_behaviours())
-    obs = np.stack([[np.random.default_rng([row, step]).normal(size=3) for step in range(4)] for row in range(2)])
-    batch = {
-        "obs": torch.from_numpy(facts.normalize(obs.astype(np.float32))),
-        "actions": torch.from_numpy(actions),
-        "rtg": torch.tensor([8.0, 7.0, 6.0, 5.0])[None, :, None].expand(2, 4, 1) / facts.return_scale,
-        "timesteps": torch.arange(4).expand(2, 4),
-        "valid": torch.ones(2, 4, dtype=torch.bool),
-    }
-    model = dt.build_model(SMALL, facts).eval()
-    model.load_state_dict(safetensors.torch.load_file(run / "model.safetensors"))
-    with torch.no_grad():
-        expected = dt.predict_actions(model, batch).numpy()
-    np.testing.assert_allclose(actions, expected, atol=0.02 if policy.meta["precision"] == "bf16" else 1e-5)
+    obs = np.stack([[np.random.default_rng([row, step]).normal(size=3) for step in range(7)] for row in range(2)])
+    model = dt.build_model(config, facts).eval()
+    model.load_state_dict(safetensors.torch.load_file(folder / "model.safetensors"))
+    for step in range(7):
+        first = max(0, step - 3)
+        window, n = slice(first, step + 1), step + 1 - first
+        timestep = torch.arange(n) + (first if timesteps == "absolute" else 0)
+        batch = {
+            "obs": torch.from_numpy(facts.normalize(obs[:, window].astype(np.float32))),
+            "actions": torch.from_numpy(actions[:, window]),
+            "rtg": (8.0 - torch.arange(first, step + 1.0))[None, :, None].expand(2, n, 1) / facts.return_scale,
+            "timesteps": timestep.expand(2, n),
+            "valid": torch.ones(2, n, dtype=torch.bool),
+        }
+        with torch.no_grad():
+            expected = dt.predict_actions(model, batch)[:, -1].numpy()
+        np.testing.assert_allclose(
+            actions[:, step], expected, atol=0.02 if policy.meta["precision"] == "bf16" else 1e-5
+        )
+
+
+def test_relative_timesteps_count_from_the_window_and_know_no_longest_episode(tmp_path: Path) -> None:
+    config = replace(SMALL, timesteps="relative")
+    episodes = [episode(n, seed=n) for n in (2, 9)]
+    batch = dt.make_sampler(config, describe_data(episodes), episodes)(np.random.default_rng(0))
+    for valid, timesteps in zip(batch["valid"], batch["timesteps"], strict=True):
+        assert timesteps[valid].tolist() == list(range(int(valid.sum())))
+        assert not timesteps[~valid].any()
+    policy = load_policy(train("dt", config, episodes, tmp_path / "run", n_updates=1, seed=0, meta={}, threads=1))
+    assert np.isfinite(play(policy, 1.0, steps=30)).all()
 
 
 def test_what_stands_in_the_padding_changes_neither_the_loss_nor_its_gradient() -> None:

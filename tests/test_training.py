@@ -8,15 +8,17 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator  # type: ignore[import-untyped]
 
-from zest_rl.agents import AGENTS
+from zest_rl.agents import AGENTS, load_policy
 from zest_rl.agents.base import describe_data
 from zest_rl.agents.bc import BCConfig
 from zest_rl.agents.dt import DTConfig
@@ -112,6 +114,34 @@ def test_the_same_seed_gives_the_same_weights_and_another_seed_others(whole: Pat
     torch.rand(7)  # torch's own generator plays no part
     assert (start(tmp_path / "same", whole.name) / "model.safetensors").read_bytes() == weights
     assert (start(tmp_path / "other", whole.name, seed=4) / "model.safetensors").read_bytes() != weights
+
+
+def test_the_policy_acts_with_the_moving_average_of_the_weights(tmp_path: Path) -> None:
+    """Snapshots without averaging are the trained weights after each update; their average is done by hand."""
+    config, n = CONFIGS["bc"], 12
+    plain = tmp_path / "plain"
+    train("bc", replace(config, ema_decay=0.0), make_episodes(), plain, n_updates=n, seed=3, meta={}, snapshot_every=1)
+    averaged = tmp_path / "averaged"
+    train("bc", replace(config, ema_decay=0.5), make_episodes(), averaged, n_updates=n, seed=3, meta={})
+    weights = [load_file(folder / "model.safetensors") for folder in (*sorted((plain / "snapshots").iterdir()), plain)]
+    assert len(weights) == n
+    torch.manual_seed(3)
+    expected = dict(AGENTS["bc"].build(config, describe_data(make_episodes())).named_parameters())
+    for update, new in enumerate(weights, 1):
+        decay = min(0.5, (1 + update) / (10 + update))
+        expected = {name: decay * mean + (1 - decay) * new[name] for name, mean in expected.items()}
+    for name, mean in load_file(averaged / "model.safetensors").items():
+        torch.testing.assert_close(mean, expected[name].detach(), rtol=1e-5, atol=1e-6)
+
+
+def test_snapshots_are_the_policies_of_shorter_trainings(whole: Path, tmp_path: Path) -> None:
+    run = start(tmp_path / "run", whole.name, snapshot_every=12)
+    assert (run / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
+    assert [folder.name for folder in sorted((run / "snapshots").iterdir())] == ["update-000000012", "update-000000024"]
+    snapshot, shorter = run / "snapshots" / "update-000000024", start(tmp_path / "shorter", whole.name, n_updates=24)
+    assert (snapshot / "model.safetensors").read_bytes() == (shorter / "model.safetensors").read_bytes()
+    policy = load_policy(snapshot)
+    assert policy.meta["n_updates"] == 24
 
 
 def test_training_leaves_torchs_generator_and_threads_alone(tmp_path: Path) -> None:

@@ -210,6 +210,24 @@ def episode_panels(name: str, evaluation: Evaluation, scorer: Scorer | None) -> 
     return panels
 
 
+def snapshots(run: Path) -> list[Path]:
+    """Folders of the policies that a training left on its way, the earliest first."""
+    return sorted((run / "snapshots").glob("update-*"))
+
+
+def return_curve(method: Method) -> Curve | None:
+    """Normalized return over gradient steps, the mean over seeds with their range; None without evaluated snapshots."""
+    columns: list[dict[int, float]] = []
+    for run in method.runs:
+        evaluated = [folder for folder in snapshots(run) if any(folder.glob("evaluations/*/result.json"))]
+        by_policy = {policy: replace(method, runs=(policy,)).evaluations()[0] for policy in (*evaluated, run)}
+        columns.append({read_meta(p)["n_updates"]: float(e.normalized().mean()) for p, e in by_policy.items()})
+    steps = sorted(set.intersection(*(set(column) for column in columns)))
+    if len(steps) < 2:
+        return None
+    return _curve(method.name, "normalized return, %", steps, [[column[step] for step in steps] for column in columns])
+
+
 def learning_curve(method: Method) -> Curve | None:
     """Training loss over gradient steps, the mean over seeds with their range."""
     columns = []
@@ -219,16 +237,25 @@ def learning_curve(method: Method) -> Curve | None:
     length = min(map(len, columns))
     if length < 2:
         return None
-    losses = np.array([[loss for _, loss in column[:length]] for column in columns], dtype=np.float32)
-    steps = np.array([update for update, _ in columns[0][:length]], dtype=np.float32)
-    several = len(losses) > 1
-    return Curve(
+    return _curve(
         method.name,
         "training loss (mean squared error of actions)",
-        steps,
-        losses.mean(axis=0),
-        losses.min(axis=0) if several else None,
-        losses.max(axis=0) if several else None,
+        [update for update, _ in columns[0][:length]],
+        [[loss for _, loss in column[:length]] for column in columns],
+    )
+
+
+def _curve(name: str, quantity: str, steps: Sequence[float], columns: Sequence[Sequence[float]]) -> Curve:
+    """Mean and range over seeds: one column per seed, each as long as `steps`."""
+    values = np.array(columns, dtype=np.float32)
+    several = len(values) > 1
+    return Curve(
+        name,
+        quantity,
+        np.array(steps, dtype=np.float32),
+        values.mean(axis=0),
+        values.min(axis=0) if several else None,
+        values.max(axis=0) if several else None,
     )
 
 
@@ -279,7 +306,12 @@ def compare(
         goals=tuple(goal_panel(name, dataset_id, scatters[name]) for name, dataset_id in goals.items()),
         episodes=tuple(panels),
         scatters=tuple(scatters.values()),
-        curves=tuple(curve for method in methods if (curve := learning_curve(method)) is not None),
+        curves=tuple(
+            curve
+            for draw in (return_curve, learning_curve)
+            for method in methods
+            if (curve := draw(method)) is not None
+        ),
         details={**(details or {}), **{f"run {Path(run).name}": meta for run, meta in metas.items()}},
         caveats=(*caveats, *_unequal_starts(evaluations)),
     )

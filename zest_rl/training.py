@@ -5,12 +5,13 @@ A run folder, and what each part of it is for::
     run.json            what was asked for; a rerun that asks for something else is refused
     metrics.csv, tb/    loss, gradient norm, learning rate, updates per second; tb/ is for TensorBoard
     checkpoints/        the last two states of an unfinished run, each with a sha256 manifest
-    model.safetensors   the trained weights
+    snapshots/          policies on the way, if asked for: each with the two files below, as `zest evaluate` takes them
+    model.safetensors   the weights to act with: the moving average of the trained ones
     meta.json           everything needed to load and to trace them; written last, so it says "finished"
 
 A run that was killed at any moment and is started again with the same arguments ends with the same bits as one that
-was not (on a CPU, with the same number of threads): weights, optimizer, both random generators and the running means
-are restored from the last checkpoint, and rows of the log after it are dropped.
+was not (on a CPU, with the same number of threads): weights, their average, optimizer, both random generators and the
+running means are restored from the last checkpoint, and rows of the log after it are dropped.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,13 +37,13 @@ from torch.utils.tensorboard import SummaryWriter
 from zest_rl import artifacts
 from zest_rl.agents import get_agent
 from zest_rl.agents.base import DataFacts, Rules, autocast, check_fields, describe_data, resolve_precision
+from zest_rl.checkpoints import TrainState, resume, save_checkpoint
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.types import Episode
 
 Progress = Callable[[int, dict[str, float]], None]
 COLUMNS = ("loss", "grad_norm", "learning_rate", "updates_per_s")
 RESULT_KEYS = ("n_params", "model_sha256", "train_seconds", "made_by")  # keys of meta.json that only the end knows
-N_CHECKPOINTS = 2
 
 
 def train(
@@ -58,6 +59,7 @@ def train(
     threads: int | None = None,
     checkpoint_every: int = 500,
     log_every: int = 50,
+    snapshot_every: int | None = None,
     on_progress: Progress | None = None,
 ) -> Path:
     """Train a policy, or go on with a run that was cut short; return `run_dir`. A finished run returns at once.
@@ -74,6 +76,7 @@ def train(
         threads: CPU threads; torch's current number by default. Bits depend on it, so it is recorded.
         checkpoint_every: updates between checkpoints.
         log_every: updates between rows of the log; a row holds means over the updates since the last one.
+        snapshot_every: updates between policies kept under ``snapshots/``, for learning curves; none by default.
         on_progress: called after every logged row with the number of updates done and the row.
 
     Raises:
@@ -84,7 +87,7 @@ def train(
     if not isinstance(config, definition.config):
         raise BadInput(f"agent {agent!r} takes a {definition.config.__name__}, got a {type(config).__name__}")
     n_threads = torch.get_num_threads() if threads is None else threads
-    arguments = _Arguments(n_updates, seed, n_threads, checkpoint_every, log_every)
+    arguments = _Arguments(n_updates, seed, n_threads, checkpoint_every, log_every, snapshot_every)
     place = _find_device(device)
     facts = describe_data(episodes)
     sample = definition.sampler(config, facts, episodes)
@@ -96,6 +99,7 @@ def train(
         "seed": seed,
         "device": str(place),
         "threads": arguments.threads,
+        "snapshot_every": snapshot_every,
         "precision": precision,
         "data_sha256": artifacts.hash_arrays(*(a for e in episodes for a in (e.obs, e.actions, e.rewards))),
     }
@@ -108,16 +112,22 @@ def train(
         _claim(run_dir, request)
         if not (run_dir / "meta.json").exists():
             with _torch_set_up(seed, arguments.threads, place):
-                state = _State.start(definition.build(config, facts).to(place), config.weight_decay, seed)
-                _resume(run_dir, state)
+                state = TrainState.start(definition.build(config, facts).to(place), config.weight_decay, seed)
+                resume(run_dir, state)
 
                 def draw_loss() -> Tensor:
                     batch = {name: tensor.to(place) for name, tensor in sample(state.rng).items()}
                     with autocast(precision, place):
                         return definition.loss(state.model, batch)
 
-                _fit(run_dir, state, draw_loss, config, arguments, on_progress)
-            _finish(run_dir, state, request, facts)
+                def keep_snapshot() -> None:
+                    folder = run_dir / "snapshots" / f"update-{state.update:09d}"
+                    if not folder.exists():
+                        with artifacts.staged_folder(folder) as staging:
+                            _write_policy(staging, state, request | {"n_updates": state.update}, facts)
+
+                _fit(run_dir, state, draw_loss, config, arguments, keep_snapshot, on_progress)
+            _write_policy(run_dir, state, request, facts)
         shutil.rmtree(run_dir / "checkpoints", ignore_errors=True)
     return run_dir
 
@@ -129,6 +139,7 @@ class _Arguments:
     threads: int
     checkpoint_every: int
     log_every: int
+    snapshot_every: int | None
 
     def __post_init__(self) -> None:
         rules: Rules = {
@@ -137,31 +148,9 @@ class _Arguments:
                 name: (getattr(self, name) >= 1, "at least 1")
                 for name in ("n_updates", "threads", "checkpoint_every", "log_every")
             },
+            "snapshot_every": (self.snapshot_every is None or self.snapshot_every >= 1, "at least 1, or None"),
         }
         check_fields("training", self, rules)
-
-
-@dataclass
-class _State:
-    """All that changes while training, and that a checkpoint therefore holds (with torch's random generators)."""
-
-    model: nn.Module
-    optimizer: torch.optim.Optimizer
-    rng: np.random.Generator
-    update: int = 0
-    recent: list[tuple[float, float]] = field(default_factory=list)  # (loss, gradient norm) since the last logged row
-    seconds: float = 0.0
-
-    @classmethod
-    def start(cls, model: nn.Module, weight_decay: float, seed: int) -> _State:
-        trained = [p for p in model.parameters() if p.requires_grad]
-        optimizer = torch.optim.AdamW(trained, weight_decay=weight_decay, fused=True)
-        return cls(model.train(), optimizer, np.random.default_rng(seed))
-
-    @property
-    def params(self) -> dict[str, nn.Parameter]:
-        """Trained parameters by name, in the optimizer's order."""
-        return {name: p for name, p in self.model.named_parameters() if p.requires_grad}
 
 
 # ------------------------------------------------------------------------------------------------------------ loop
@@ -169,10 +158,11 @@ class _State:
 
 def _fit(
     run_dir: Path,
-    state: _State,
+    state: TrainState,
     draw_loss: Callable[[], Tensor],
     config: Any,
     arguments: _Arguments,
+    keep_snapshot: Callable[[], None],
     on_progress: Progress | None,
 ) -> None:
     params = list(state.params.values())
@@ -189,6 +179,7 @@ def _fit(
             norm = nn.utils.clip_grad_norm_(params, config.grad_clip)
             state.optimizer.step()
             state.update += 1
+            state.follow(params, config.ema_decay)
             state.recent.append((loss.item(), norm.item()))
             if not all(map(math.isfinite, state.recent[-1])):
                 raise ZestError(
@@ -207,7 +198,10 @@ def _fit(
                 if on_progress is not None:
                     on_progress(state.update, row)
             if state.update % arguments.checkpoint_every == 0 and state.update < arguments.n_updates:
-                _save_checkpoint(run_dir, state)
+                save_checkpoint(run_dir, state)
+            every = arguments.snapshot_every
+            if every is not None and state.update % every == 0 and state.update < arguments.n_updates:
+                keep_snapshot()
 
 
 @contextmanager
@@ -264,83 +258,6 @@ def _open_log(run_dir: Path, n_done: int) -> Iterator[Callable[[int, Mapping[str
             board.close()
 
 
-# ----------------------------------------------------------------------------------------------------- checkpoints
-
-
-def _save_checkpoint(run_dir: Path, state: _State) -> None:
-    """Write the state under ``checkpoints/update-N`` and remove all but the newest `N_CHECKPOINTS`."""
-    folder = run_dir / "checkpoints" / f"update-{state.update:09d}"
-    moments = {
-        f"{name}/{key}": tensor
-        for name, parameter in state.params.items()
-        for key, tensor in state.optimizer.state[parameter].items()
-    }
-    generators = {"cpu": torch.get_rng_state()}
-    cuda = next(state.model.parameters()).device
-    if cuda.type == "cuda":
-        generators["cuda"] = torch.cuda.get_rng_state(cuda)
-    weights = state.model.state_dict()
-    artifacts.check_free_space(run_dir, sum(t.nbytes for t in (*weights.values(), *moments.values())))
-    with artifacts.staged_folder(folder) as staging:
-        for name, tensors in (("model", weights), ("optimizer", moments), ("generators", generators)):
-            safetensors.torch.save_file(tensors, staging / f"{name}.safetensors")
-        progress = {
-            "update": state.update,
-            "seconds": state.seconds,
-            "recent": state.recent,
-            "sampler": state.rng.bit_generator.state,
-        }
-        artifacts.write_json(staging / "state.json", progress)
-        manifest = {path.name: artifacts.hash_file(path) for path in sorted(staging.iterdir())}
-        artifacts.write_json(staging / "manifest.json", manifest)
-    for old in _checkpoints(run_dir)[:-N_CHECKPOINTS]:
-        shutil.rmtree(old, ignore_errors=True)
-
-
-def _checkpoints(run_dir: Path) -> list[Path]:
-    return sorted((run_dir / "checkpoints").glob("update-*"))
-
-
-def _resume(run_dir: Path, state: _State) -> None:
-    """Bring `state` and torch's generators to the newest checkpoint, if there is one."""
-    folders = _checkpoints(run_dir)
-    if not folders:
-        return
-    folder = folders[-1]
-    _verify(folder)
-    tensors = {
-        name: safetensors.torch.load_file(folder / f"{name}.safetensors")
-        for name in ("model", "optimizer", "generators")
-    }
-    state.model.load_state_dict(tensors["model"])
-    moments: dict[int, dict[str, Tensor]] = {i: {} for i in range(len(state.params))}
-    places = {name: i for i, name in enumerate(state.params)}
-    for full_name, tensor in tensors["optimizer"].items():
-        name, _, key = full_name.rpartition("/")
-        moments[places[name]][key] = tensor.clone()
-    state.optimizer.load_state_dict({"state": moments, "param_groups": state.optimizer.state_dict()["param_groups"]})
-    torch.set_rng_state(tensors["generators"]["cpu"])
-    if "cuda" in tensors["generators"]:
-        torch.cuda.set_rng_state(tensors["generators"]["cuda"], next(state.model.parameters()).device)
-    progress = artifacts.read_json(folder / "state.json")
-    state.update, state.seconds = progress["update"], progress["seconds"]
-    state.recent = [(loss, norm) for loss, norm in progress["recent"]]
-    state.rng.bit_generator.state = progress["sampler"]
-
-
-def _verify(folder: Path) -> None:
-    try:
-        manifest: dict[str, str] = artifacts.read_json(folder / "manifest.json")
-        bad = [name for name, sha256 in manifest.items() if artifacts.hash_file(folder / name) != sha256]
-    except (ZestError, OSError, AttributeError):
-        bad = ["manifest.json"]
-    if bad:
-        raise ZestError(
-            f"checkpoint {folder} is damaged: {', '.join(bad)} is not what was written; delete this folder and start "
-            "the run again, which then goes on from the checkpoint before it"
-        )
-
-
 # --------------------------------------------------------------------------------------------------- start and end
 
 
@@ -373,10 +290,10 @@ def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return items
 
 
-def _finish(run_dir: Path, state: _State, request: dict[str, Any], facts: DataFacts) -> None:
+def _write_policy(folder: Path, state: TrainState, request: dict[str, Any], facts: DataFacts) -> None:
     """Write the weights, then ``meta.json``."""
-    weights = safetensors.torch.save({name: tensor.cpu() for name, tensor in state.model.state_dict().items()})
-    artifacts.write_bytes(run_dir / "model.safetensors", weights)
+    weights = safetensors.torch.save(state.averaged_weights())
+    artifacts.write_bytes(folder / "model.safetensors", weights)
     n_params = sum(p.numel() for p in state.params.values())
     results = (n_params, artifacts.hash_bytes(weights), round(state.seconds, 1), artifacts.provenance())
-    artifacts.write_json(run_dir / "meta.json", request | asdict(facts) | dict(zip(RESULT_KEYS, results, strict=True)))
+    artifacts.write_json(folder / "meta.json", request | asdict(facts) | dict(zip(RESULT_KEYS, results, strict=True)))

@@ -134,6 +134,10 @@ class OptimizerConfig(Protocol):
         """Largest Euclidean norm of the gradient."""
 
     @property
+    def ema_decay(self) -> float:
+        """Decay of the moving average of the weights, which is what acts."""
+
+    @property
     def amp(self) -> Precision:
         """Precision of matrix products; ``auto`` is bf16 where the hardware has it."""
 
@@ -148,6 +152,7 @@ def optimizer_rules(config: OptimizerConfig) -> Rules:
         "weight_decay": (0 <= config.weight_decay < float("inf"), "0 or positive"),
         "warmup_updates": (config.warmup_updates >= 0, "0 or positive"),
         "grad_clip": (0 < config.grad_clip < float("inf"), "positive"),
+        "ema_decay": (0 <= config.ema_decay < 1, "in [0, 1)"),
         "amp": (config.amp in ("auto", "bf16", "fp32"), "one of auto, bf16, fp32"),
     }
 

@@ -6,7 +6,7 @@ Deviations from it:
   - one observation instead of the last K: a plain Markov policy;
   - hidden size 512, which gives about as many parameters as `dt.DTConfig` has (0.56 and 0.63 million for the kitchen);
   - 1280 transitions per update, as many as the Decision Transformer's 64 windows of 20;
-  - learning rate, warm-up and observation normaliser are those of `dt`.
+  - learning rate, warm-up, averaged weights and observation normaliser are those of `dt`.
 ``top_fraction`` below 1 is the "best x % BC" of that paper: only the episodes with the largest returns are cloned (a
 share of the episodes here, of the time steps there). The normaliser is measured on all episodes nevertheless, so that
 it is the same for every fraction and every agent.
@@ -62,6 +62,8 @@ class BCConfig:
     """Updates over which the step size rises linearly from 0."""
     grad_clip: float = 0.25
     """Largest Euclidean norm of the gradient."""
+    ema_decay: float = 0.999
+    """Decay of the moving average of the weights, which is what acts; 0 acts with the last weights."""
     amp: Precision = "auto"
     """Precision of matrix products; auto is bf16 where the hardware has it."""
 

@@ -6,8 +6,9 @@ is. The hyper-parameters are theirs (hidden size 128, 3 layers, 1 head, K = 20, 
 clip 0.25, weight decay 1e-4). Deviations:
   - returns are divided by the largest absolute return of the data, not by 1000;
   - learning rate 3e-4 with 200 updates of warm-up instead of 1e-4 with 10,000, as we train for thousands of updates,
-    not for a hundred thousand;
+    not for a hundred thousand; what acts is a moving average of the weights, which single updates do not shake;
   - observations are normalised with a floor under the deviation and a bound on the result (`base.STD_FLOOR`);
+  - ``timesteps="relative"`` counts time from the start of the window, so that acting late is not something new;
   - padding repeats a valid step instead of a constant; as there, nothing attends to it and the loss leaves it out;
   - transformers initialises every embedding with a deviation of 0.02, they with torch's default;
   - dropout masks are drawn four to a 64-bit random number, which is what makes them cheap on a CPU.
@@ -16,9 +17,10 @@ clip 0.25, weight decay 1e-4). Deviations:
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -43,6 +45,9 @@ from zest_rl.types import Episode, FloatArray
 # ---------------------------------------------------------------------------------------------------------- config
 
 
+Timesteps = Literal["absolute", "relative"]
+
+
 @dataclass(frozen=True)
 class DTConfig:
     """Decision Transformer."""
@@ -51,6 +56,8 @@ class DTConfig:
     """False zeroes the return-to-go: the same network without what the scores can tell it."""
     context_len: int = 20
     """K, the steps that the network sees."""
+    timesteps: Timesteps = "absolute"
+    """What a step's embedding counts from: the start of the episode, as in the paper, or the start of the window."""
     hidden_size: int = 128
     """Width of a token."""
     n_layers: int = 3
@@ -69,6 +76,8 @@ class DTConfig:
     """Updates over which the step size rises linearly from 0."""
     grad_clip: float = 0.25
     """Largest Euclidean norm of the gradient."""
+    ema_decay: float = 0.999
+    """Decay of the moving average of the weights, which is what acts; 0 acts with the last weights."""
     amp: Precision = "auto"
     """Precision of matrix products; auto is bf16 where the hardware has it."""
 
@@ -82,6 +91,7 @@ class DTConfig:
                 f"a divisor of hidden_size ({self.hidden_size})",
             ),
             "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
+            "timesteps": (self.timesteps in get_args(Timesteps), f"one of {', '.join(get_args(Timesteps))}"),
             "batch_size": (self.batch_size >= 1, "at least 1"),
             **optimizer_rules(self),
         })  # fmt: skip
@@ -117,7 +127,7 @@ def build_model(config: DTConfig, facts: DataFacts) -> nn.Module:
             state_dim=facts.obs_dim,
             act_dim=facts.act_dim,
             hidden_size=config.hidden_size,
-            max_ep_len=facts.max_steps,
+            max_ep_len=facts.max_steps if config.timesteps == "absolute" else config.context_len,
             n_positions=3 * config.context_len,
             n_layer=config.n_layers,
             n_head=config.n_heads,
@@ -177,17 +187,18 @@ def make_sampler(config: DTConfig, facts: DataFacts, episodes: Sequence[Episode]
     obs = torch.from_numpy(facts.normalize(np.concatenate([e.obs[:-1] for e in episodes])))
     actions = torch.from_numpy(np.concatenate([e.actions for e in episodes]))
     rtg = torch.from_numpy(np.concatenate([returns_to_go(e.rewards)[:-1] for e in episodes]) / np.float32(scale))
-    timesteps = torch.from_numpy(np.concatenate([np.arange(n) for n in lengths]))
+    since_start = np.concatenate([np.arange(n) for n in lengths])
 
     def sample(rng: np.random.Generator) -> Batch:
         first = rng.integers(len(ends), size=(config.batch_size, 1))
         steps = np.minimum(first + config.context_len, ends[first]) + np.arange(-config.context_len, 0)
         index = torch.from_numpy(np.maximum(steps, first))
+        timesteps = np.maximum(steps - first, 0) + (since_start[first] if config.timesteps == "absolute" else 0)
         return {
             "obs": obs[index],  # [batch, K, obs_dim]
             "actions": actions[index],  # [batch, K, act_dim]
             "rtg": rtg[index][..., None],  # [batch, K, 1]
-            "timesteps": timesteps[index],  # [batch, K]
+            "timesteps": torch.from_numpy(timesteps),  # [batch, K]
             "valid": torch.from_numpy(steps >= first),  # [batch, K], False is padding
         }
 
@@ -218,16 +229,13 @@ class DTPolicy:
         self.uses_return = config.condition_on_return
         self._model, self._facts, self._device = model, facts, device
         self._autocast = autocast(meta["precision"], device)
-        self._context_len = config.context_len
+        self._config = config
         self._start(0, 0.0)
 
     def _start(self, n_episodes: int, target_return: float) -> None:
-        n_steps = self._facts.max_steps
         self._step = 0
         self._remaining = np.full(n_episodes, target_return)  # (N,) return still asked for, in the data's units
-        self._obs = np.zeros((n_episodes, n_steps, self._facts.obs_dim), dtype=np.float32)
-        self._actions = np.zeros((n_episodes, n_steps, self._facts.act_dim), dtype=np.float32)
-        self._rtg = np.zeros((n_episodes, n_steps, 1), dtype=np.float32)
+        self._window: deque[dict[str, FloatArray]] = deque(maxlen=self._config.context_len)
 
     def begin(self, n_episodes: int, target_return: float | None = None) -> None:
         """Forget what went before and start N episodes.
@@ -250,29 +258,31 @@ class DTPolicy:
             BadInput: the shape is wrong, or the episode outlasts the longest one of the training data.
         """
         check_obs(obs, len(self._remaining), self._facts.obs_dim)
-        step = self._step
-        if step >= self._facts.max_steps:
+        bound = self._facts.max_steps
+        if self._config.timesteps == "absolute" and self._step >= bound:
             raise BadInput(
-                f"this model knows time steps below {self._facts.max_steps}, the longest episode of its data, got step "
-                f"{step}; evaluate with a horizon of at most {self._facts.max_steps}"
+                f"this model knows time steps below {bound}, the longest episode of its data, got step {self._step}; "
+                f"evaluate with a horizon of at most {bound}, or train with timesteps 'relative'"
             )
-        self._obs[:, step] = self._facts.normalize(obs)
-        if self.uses_return:
-            self._rtg[:, step, 0] = self._remaining / self._facts.return_scale
-        window = slice(max(0, step + 1 - self._context_len), step + 1)
-        arrays = {
-            "obs": self._obs[:, window],
-            "actions": self._actions[:, window],  # the newest is still zero; only later steps could attend to it
-            "rtg": self._rtg[:, window],
-            "timesteps": np.broadcast_to(np.arange(window.start, window.stop), self._obs[:, window].shape[:2]),
-            "valid": np.ones(self._obs[:, window].shape[:2], dtype=bool),
+        n = len(obs)
+        rtg = self._remaining / self._facts.return_scale if self.uses_return else np.zeros(n)
+        step = {
+            "obs": self._facts.normalize(obs),
+            "actions": np.zeros((n, self._facts.act_dim), np.float32),  # not known yet; only later steps attend to it
+            "rtg": rtg.astype(np.float32)[:, None],
         }
+        self._window.append(step)
+        length = len(self._window)
+        first = 0 if self._config.timesteps == "relative" else self._step + 1 - length
+        arrays = {name: np.stack([earlier[name] for earlier in self._window], axis=1) for name in step}
+        arrays["timesteps"] = np.broadcast_to(first + np.arange(length), (n, length))
+        arrays["valid"] = np.ones((n, length), dtype=bool)
         batch = {name: torch.tensor(array, device=self._device) for name, array in arrays.items()}
         with self._autocast:
-            actions = predict_actions(self._model, batch)[:, -1]
-        self._actions[:, step] = actions.cpu().numpy()
+            actions = predict_actions(self._model, batch)[:, -1].cpu().numpy()
+        step["actions"] = actions
         self._step += 1
-        return self._actions[:, step].copy()
+        return actions.copy()
 
     def observe(self, rewards: FloatArray) -> None:
         """Take the rewards (N,) of the last actions off the returns still asked for."""

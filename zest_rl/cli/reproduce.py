@@ -217,10 +217,12 @@ def _work(cell: Cell) -> dict[str, Any]:
 
     from zest_rl.cli import evaluate, train
     from zest_rl.cli.recipes import load_config
+    from zest_rl.comparison import snapshots
 
     train.run(load_config(train.CONFIGS[cell.agent], cell.train, cell.method), SilentUi())
     trained = time.monotonic()
-    evaluate.run(load_config(evaluate.Config, cell.evaluate, cell.method), SilentUi())
+    for run in (cell.run, *snapshots(cell.run)):
+        evaluate.run(load_config(evaluate.Config, {**cell.evaluate, "run": str(run)}, cell.method), SilentUi())
     return {"evaluate_seconds": np.array(time.monotonic() - trained)}
 
 

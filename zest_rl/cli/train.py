@@ -33,6 +33,8 @@ class Arguments:
     """Updates between checkpoints, from which a cut run goes on."""
     log_every: int = 50
     """Updates between log rows (metrics.csv, TensorBoard)."""
+    snapshot_every: int | None = None
+    """Updates between policies kept in RUN/snapshots, which `zest evaluate` takes too; default none."""
 
 
 def __getattr__(name: str) -> Any:
@@ -95,10 +97,12 @@ def train_on_dataset(config: Arguments, agent_config: Any, run_dir: Path, ui: Ui
             threads=config.threads,
             checkpoint_every=config.checkpoint_every,
             log_every=config.log_every,
+            snapshot_every=config.snapshot_every,
             on_progress=on_progress,
         )
     scorer = data.dataset_path(config.dataset) / SCORER_FILE
     if scorer.exists():
-        artifacts.write_bytes(run_dir / SCORER_FILE, scorer.read_bytes())
+        for folder in (run_dir, *run_dir.glob("snapshots/*")):
+            artifacts.write_bytes(folder / SCORER_FILE, scorer.read_bytes())
     meta: dict[str, Any] = artifacts.read_json(run_dir / "meta.json")
     return meta
