@@ -115,16 +115,16 @@ def trained(trained_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 @pytest.fixture(scope="module")
 def short_videos() -> Iterator[None]:
     """Write the first 2 states of a video only."""
-    from zest_rl import comparison, videos
+    from zest_rl import panels, videos
 
     write_video = videos.write_video
 
-    def short_video(states: np.ndarray, path: Path, **_: object) -> Path:
-        return write_video(states[:2], path, size=64)
+    def short_video(states: np.ndarray, path: Path, *, beside: np.ndarray | None = None) -> Path:
+        return write_video(states[:2], path, beside=None if beside is None else beside[:2], size=64)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(videos, "write_video", short_video)
-        patch.setattr(comparison, "write_video", short_video)
+        patch.setattr(panels, "write_video", short_video)
         yield
 
 

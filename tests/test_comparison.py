@@ -13,29 +13,27 @@ import numpy as np
 import pytest
 from conftest import COLLECTED
 
-from zest_rl import comparison, data, metrics
+from zest_rl import data, metrics
 from zest_rl.comparison import (
     Method,
     compare,
     dataset_row,
-    goal_panel,
-    goal_scatter,
     latest_evaluation,
     learning_curve,
     method_row,
     methods_of_runs,
+    return_curve,
 )
 from zest_rl.errors import BadInput
 from zest_rl.evaluation import EvaluationConfig, evaluate
-from zest_rl.videos import write_video
+from zest_rl.panels import goal_panel, goal_scatter, paired_panels
 
 CONFIG = EvaluationConfig(n_episodes=2, seed=11, rtg="constant")
 
 
 @pytest.fixture(autouse=True)
-def _short_videos(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Render the first 2 states of an episode only."""
-    monkeypatch.setattr(comparison, "write_video", lambda states, path: write_video(states[:2], path, size=64))
+def _short(short_videos: None) -> None:
+    """Nobody looks at these videos."""
 
 
 @pytest.fixture
@@ -64,11 +62,21 @@ def test_a_report_compares_methods_with_the_dataset_and_shows_goal_episodes_and_
         ("BC", "method", 2, 4),
         ("DT on same-scene", "method", 1, 2),
     ]
-    assert [panel.title for panel in report.episodes] == [
+    single, paired = report.episodes[:6], report.episodes[6:]
+    assert [panel.title for panel in single] == [
         f"{method}: {which}" for method in ("BC", "DT on same-scene") for which in ("best", "median", "worst")
     ]
     assert all(panel.video.stat().st_size > 0 for panel in report.episodes)
-    assert all(panel.scores is not None and len(panel.scores) == len(panel.gt_progress) for panel in report.episodes)
+    assert all(panel.scores is not None and len(panel.scores) == len(panel.gt_progress) for panel in single)
+    clone, other = (latest_evaluation(evaluated / name) for name in ("bc-0", "dt-0"))
+    gains = other.normalized() - clone.normalized()
+    for panel, which, index in zip(paired, ("best", "median", "worst"), np.argsort(-gains)[[0, 1, 1]], strict=True):
+        assert panel.title.startswith(f"BC (left, {clone.normalized()[index]:.0f} %) beside DT on same-scene (right)")
+        assert panel.title.endswith(f"{which} gain")
+        assert panel.seed == clone.episodes[index].seed == other.episodes[index].seed
+        np.testing.assert_array_equal(panel.gt_progress, other.traces["gt_reward"][index])
+        assert panel.beside is not None
+        np.testing.assert_array_equal(panel.beside[1], clone.traces["gt_reward"][index])
     assert [goal.name for goal in report.goals] == ["scene"]
     assert [curve.method for curve in report.curves] == ["BC", "DT on same-scene"]
     assert report.curves[0].low is not None, "two seeds have a range"
@@ -107,6 +115,32 @@ def test_a_goal_is_judged_by_how_its_returns_rank_the_episodes(trained: Path) ->
     panel = goal_panel("scene", dataset, scatter)
     assert (len(panel.start), len(panel.goal), panel.n_episodes) == (1, 1, 4)
     assert not np.array_equal(panel.start[0], panel.goal[0])
+
+
+def test_policies_are_shown_side_by_side_only_on_equal_starts(evaluated: Path) -> None:
+    clone, other = (latest_evaluation(evaluated / name) for name in ("bc-0", "dt-0"))
+    elsewhere = replace(other, config=replace(other.config, seed=99))
+    assert len(paired_panels(("BC", clone), ("DT", other))) == 3
+    assert paired_panels(("BC", clone), ("DT", elsewhere)) == []
+
+
+def test_a_return_curve_holds_the_snapshots_that_were_evaluated_in_every_run(trained: Path) -> None:
+    runs = (trained / "bc-0", trained / "bc-1")
+    method = Method("BC", runs, evaluation=CONFIG)
+    for run in runs:
+        evaluate(run, CONFIG, n_workers=1)
+    assert return_curve(method) is None, "without snapshots there is one point only"
+    for run, steps in zip(runs, ((1, 2), (1,)), strict=True):
+        for step in steps:
+            snapshot = shutil.copytree(run, run / "snapshots" / f"update-{step:09d}", ignore=lambda *_: ["snapshots"])
+            edit(snapshot, lambda meta, step=step: meta.update(n_updates=step))  # type: ignore[misc]
+    curve = return_curve(method)
+    assert curve is not None
+    assert curve.steps.tolist() == [1, float(json.loads((runs[0] / "meta.json").read_text())["n_updates"])]
+    means = [latest_evaluation(run).normalized().mean() for run in runs]
+    np.testing.assert_allclose(curve.values, np.mean(means), rtol=1e-6)
+    assert curve.low is not None
+    np.testing.assert_allclose(curve.low, min(means), rtol=1e-6)
 
 
 def test_too_few_episodes_to_rank_are_no_failure(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:

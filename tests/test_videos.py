@@ -36,6 +36,16 @@ def test_a_video_is_h264_with_one_frame_per_state_and_shows_the_states(states: n
     assert [file.name for file in path.parent.iterdir()] == ["best.mp4"], "nothing else is left behind"
 
 
+def test_two_episodes_are_shown_side_by_side(states: np.ndarray, tmp_path: Path) -> None:
+    path = write_video(states[:3], tmp_path / "pair.mp4", beside=states[::-1][:3], size=96)
+    frames = np.stack([np.asarray(frame) for frame in imageio.mimread(path)]).astype(float)
+    assert frames.shape == (3, 96, 192, 3)
+    with StateRenderer(RenderConfig(size=96, robot=True), (SCENE,)) as renderer:
+        for side, episode in ((frames[:, :, :96], states), (frames[:, :, 96:], states[::-1])):
+            for shown, state in zip(side, episode[:3], strict=True):
+                assert np.abs(shown - renderer.render(state)[0].astype(float)).mean() < 8
+
+
 def test_a_video_can_be_written_over_an_old_one(states: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     path.write_bytes(b"not a video")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,14 +15,11 @@ from numpy.typing import NDArray
 from zest_rl import artifacts, data, metrics
 from zest_rl.errors import BadInput
 from zest_rl.evaluation import Evaluation, EvaluationConfig, check_finished, evaluation_folder, read_evaluation
-from zest_rl.images import list_images, read_image
-from zest_rl.relabel import GOAL_FOLDER, SCORER_FILE
-from zest_rl.report import Curve, EpisodePanel, GoalPanel, MethodRow, Report, Scatter, Section
+from zest_rl.panels import episode_panels, goal_panel, goal_scatter, paired_panels
+from zest_rl.relabel import SCORER_FILE
+from zest_rl.report import Curve, MethodRow, Report, Section
 from zest_rl.report.data import Kind
 from zest_rl.scorer import Scorer
-from zest_rl.videos import FPS, representative, write_video
-
-MIN_EPISODES_TO_RANK = 3
 
 
 @dataclass(frozen=True)
@@ -163,53 +159,6 @@ def _row(groups: list[list[NDArray[np.float64]]], success_rate: float, **named: 
     )
 
 
-def goal_scatter(name: str, dataset_id: str) -> Scatter:
-    """ZeST return against ground-truth return of a relabeled dataset's episodes."""
-    zest = np.array([score[1:].sum() for score in data.read_scores(dataset_id)], dtype=np.float32)
-    truth = np.array([e.episode_return for e in data.read_ground_truth(dataset_id)], dtype=np.float32)
-    rho = metrics.Estimate(math.nan, math.nan, math.nan)
-    if len(zest) >= MIN_EPISODES_TO_RANK:
-        rho = metrics.spearman(zest.astype(np.float64), truth.astype(np.float64))
-    return Scatter(name, zest, truth, rho.value, (rho.low, rho.high))
-
-
-def goal_panel(name: str, dataset_id: str, scatter: Scatter) -> GoalPanel:
-    """The goal of a relabeled dataset, as pictures or sentences."""
-    config = data.describe(dataset_id)["zest"]["relabel"]["scorer"]["config"]
-    folder = data.dataset_path(dataset_id) / GOAL_FOLDER
-    if folder.is_dir():
-        start, goal = (tuple(read_image(path) for path in list_images(folder / part)) for part in ("init", "goal"))
-        return GoalPanel(name, start, goal, scatter.spearman, len(scatter.gt_returns))
-    sides = [side.strip() for side in config["goal"].removeprefix("text:").split("->")]
-    return GoalPanel(name, (sides[0],), (sides[-1],), scatter.spearman, len(scatter.gt_returns))
-
-
-def episode_panels(name: str, evaluation: Evaluation, scorer: Scorer | None) -> list[EpisodePanel]:
-    """Best, median and worst episode of an evaluation: video, score over time, ground-truth progress."""
-    panels = []
-    folder = evaluation_folder(evaluation.run, evaluation.config)
-    values = evaluation.normalized()
-    for which, index in representative(values).items():
-        states: NDArray[np.float64] = evaluation.traces["qpos"][index]
-        video = folder / f"{which}.mp4"
-        if not video.exists():
-            write_video(states, video)
-        panels.append(
-            EpisodePanel(
-                title=f"{name}: {which}",
-                method=name,
-                seed=evaluation.episodes[index].seed,
-                normalized_return=float(values[index]),
-                success=evaluation.episodes[index].success,
-                video=video,
-                fps=FPS,
-                gt_progress=np.asarray(evaluation.traces["gt_reward"][index], dtype=np.float32),
-                scores=None if scorer is None else scorer.score_episodes([states])[0][0],
-            )
-        )
-    return panels
-
-
 def snapshots(run: Path) -> list[Path]:
     """Folders of the policies that a training left on its way, the earliest first."""
     return sorted((run / "snapshots").glob("update-*"))
@@ -299,6 +248,12 @@ def compare(
     panels = [p for m in shown for p in episode_panels(m.name, evaluations[m.name][0], scorer)]
     if scorer is not None:
         scorer.states.flush()
+    cloned = next((method.name for method in shown if _agent(metas, method) == "bc"), None)
+    if cloned is not None:
+        others = [method.name for method in shown if _agent(metas, method) != "bc"]
+        panels += [
+            p for name in others for p in paired_panels((cloned, evaluations[cloned][0]), (name, evaluations[name][0]))
+        ]
     return Report(
         title=title,
         summary_sentence=_best_sentence(rows),
@@ -361,6 +316,10 @@ def overview(
         details=details or {},
         caveats=tuple(caveats),
     )
+
+
+def _agent(metas: Mapping[str, dict[str, Any]], method: Method) -> str:
+    return str(metas[str(method.runs[0])]["agent"])
 
 
 def _names(methods: Mapping[str, Sequence[Method]]) -> list[str]:

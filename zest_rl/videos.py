@@ -6,7 +6,7 @@ from pathlib import Path
 
 import imageio.v2 as imageio
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from zest_rl import artifacts
 from zest_rl.rendering import Camera, RenderConfig, StateRenderer
@@ -17,16 +17,22 @@ FPS = 12.5
 """Frames per second of the environment: a video runs in real time."""
 
 
-def write_video(states: NDArray[np.float64], path: Path, *, size: int = 320) -> Path:
+def write_video(
+    states: NDArray[np.float64], path: Path, *, beside: NDArray[np.float64] | None = None, size: int = 320
+) -> Path:
     """Render an episode and write it as H.264.
 
     Args:
         states: (T+1, nq) simulator positions.
         path: where the MP4 is left, atomically.
+        beside: (T+1, nq) of another episode, which is shown to the right.
         size: side of the square frames, in pixels; even.
     """
+    episodes = [states] if beside is None else [states, beside]
     with StateRenderer(RenderConfig(size=size, robot=True), (SCENE,)) as renderer:
-        frames = [renderer.render(qpos)[0] for qpos in states]
+        frames: list[ArrayLike] = [
+            np.hstack([renderer.render(qpos)[0] for qpos in step]) for step in zip(*episodes, strict=True)
+        ]
     with artifacts.atomic_path(path) as temporary:
         mp4 = temporary.with_suffix(".mp4")
         try:

@@ -96,6 +96,8 @@ class EpisodePanel:
     """(T+1,) float32, the ground-truth progress of the task's joint in [0, 1]; shown as evaluation only."""
     scores: FloatArray | None = None
     """(T+1,) float32, the ZeST score of every frame; None when the policy was not scored."""
+    beside: tuple[str, FloatArray] | None = None
+    """Another method on the same start, to the left in the video: its name and progress (T+1,) float32."""
 
     def __post_init__(self) -> None:
         if not 0 < self.fps < math.inf:
@@ -108,6 +110,8 @@ class EpisodePanel:
             )
         if self.scores is not None:
             _check_equal_lengths(self.title, {"scores": len(self.scores), "gt_progress": len(self.gt_progress)})
+        if self.beside is not None:
+            _check_equal_lengths(self.title, {"beside": len(self.beside[1]), "gt_progress": len(self.gt_progress)})
 
 
 @dataclass(frozen=True)

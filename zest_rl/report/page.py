@@ -150,8 +150,13 @@ def _episode(panel: EpisodePanel, score_range: tuple[float, float]) -> str:
         )
         plots.append(_track("score", "ZeST score", "the reward", chart))
     label = f"Ground-truth progress over {last} steps of {panel.title}"
-    chart = charts.line_chart([Line(steps, panel.gt_progress, "gt")], label, tall=False, y_holds=(0, 1), scrub=True)
-    plots.append(_track("gt", "Ground-truth progress", "evaluation only", chart))
+    lines, remark = [Line(steps, panel.gt_progress, "gt")], "evaluation only"
+    if panel.beside is not None:
+        name, progress = panel.beside
+        lines.append(Line(steps, progress, "c1"))
+        remark = f"evaluation only; {charts.line_key('c1')} {escape(name)}"
+    chart = charts.line_chart(lines, label, tall=False, y_holds=(0, 1), scrub=True)
+    plots.append(_track("gt", "Ground-truth progress", remark, chart))
     outcome = '<span class="tag yes">✓ success</span>' if panel.success else '<span class="tag no">✕ no success</span>'
     return (
         f'<article class="card episode"><header><h3>{title}</h3><p>{escape(panel.method)} · seed {panel.seed} · '

@@ -1,0 +1,98 @@
+"""Evaluations and relabeled datasets → what a report shows of them: goals, rankings, episodes with their videos."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl import data, metrics
+from zest_rl.evaluation import Evaluation, evaluation_folder
+from zest_rl.images import list_images, read_image
+from zest_rl.relabel import GOAL_FOLDER
+from zest_rl.report import EpisodePanel, GoalPanel, Scatter
+from zest_rl.scorer import Scorer
+from zest_rl.videos import FPS, representative, write_video
+
+MIN_EPISODES_TO_RANK = 3
+
+
+def goal_scatter(name: str, dataset_id: str) -> Scatter:
+    """ZeST return against ground-truth return of a relabeled dataset's episodes."""
+    zest = np.array([score[1:].sum() for score in data.read_scores(dataset_id)], dtype=np.float32)
+    truth = np.array([e.episode_return for e in data.read_ground_truth(dataset_id)], dtype=np.float32)
+    rho = metrics.Estimate(math.nan, math.nan, math.nan)
+    if len(zest) >= MIN_EPISODES_TO_RANK:
+        rho = metrics.spearman(zest.astype(np.float64), truth.astype(np.float64))
+    return Scatter(name, zest, truth, rho.value, (rho.low, rho.high))
+
+
+def goal_panel(name: str, dataset_id: str, scatter: Scatter) -> GoalPanel:
+    """The goal of a relabeled dataset, as pictures or sentences."""
+    config = data.describe(dataset_id)["zest"]["relabel"]["scorer"]["config"]
+    folder = data.dataset_path(dataset_id) / GOAL_FOLDER
+    if folder.is_dir():
+        start, goal = (tuple(read_image(path) for path in list_images(folder / part)) for part in ("init", "goal"))
+        return GoalPanel(name, start, goal, scatter.spearman, len(scatter.gt_returns))
+    sides = [side.strip() for side in config["goal"].removeprefix("text:").split("->")]
+    return GoalPanel(name, (sides[0],), (sides[-1],), scatter.spearman, len(scatter.gt_returns))
+
+
+def episode_panels(name: str, evaluation: Evaluation, scorer: Scorer | None) -> list[EpisodePanel]:
+    """Best, median and worst episode of an evaluation: video, score over time, ground-truth progress."""
+    panels = []
+    folder = evaluation_folder(evaluation.run, evaluation.config)
+    values = evaluation.normalized()
+    for which, index in representative(values).items():
+        states: NDArray[np.float64] = evaluation.traces["qpos"][index]
+        video = folder / f"{which}.mp4"
+        if not video.exists():
+            write_video(states, video)
+        panels.append(
+            EpisodePanel(
+                title=f"{name}: {which}",
+                method=name,
+                seed=evaluation.episodes[index].seed,
+                normalized_return=float(values[index]),
+                success=evaluation.episodes[index].success,
+                video=video,
+                fps=FPS,
+                gt_progress=np.asarray(evaluation.traces["gt_reward"][index], dtype=np.float32),
+                scores=None if scorer is None else scorer.score_episodes([states])[0][0],
+            )
+        )
+    return panels
+
+
+def paired_panels(left: tuple[str, Evaluation], right: tuple[str, Evaluation]) -> list[EpisodePanel]:
+    """Two policies on the same start side by side: where the right one gains most, gains as it mostly does, and least.
+
+    Args:
+        left: name and evaluation of one policy.
+        right: of the other; without equal starts there is nothing to pair, and the list is empty.
+    """
+    (left_name, one), (right_name, other) = left, right
+    if (one.config.seed, one.config.n_episodes) != (other.config.seed, other.config.n_episodes):
+        return []
+    panels = []
+    before, after = one.normalized(), other.normalized()
+    for which, index in representative(after - before).items():
+        folder = evaluation_folder(other.run, other.config)
+        video = folder / f"{which}-gain-over-{one.run.name}-{evaluation_folder(one.run, one.config).name}.mp4"
+        if not video.exists():
+            write_video(one.traces["qpos"][index], video, beside=other.traces["qpos"][index])
+        panels.append(
+            EpisodePanel(
+                title=f"{left_name} (left, {before[index]:.0f} %) beside {right_name} (right): {which} gain",
+                method=right_name,
+                seed=other.episodes[index].seed,
+                normalized_return=float(after[index]),
+                success=other.episodes[index].success,
+                video=video,
+                fps=FPS,
+                gt_progress=np.asarray(other.traces["gt_reward"][index], dtype=np.float32),
+                beside=(left_name, np.asarray(one.traces["gt_reward"][index], dtype=np.float32)),
+            )
+        )
+    return panels
