@@ -45,6 +45,9 @@ hidden_size = 32
 n_layers = 1
 warmup_updates = 0
 log-every = 10
+[train.dt]
+context_len = 5
+snapshot_every = 10
 
 [methods.BC]
 agent = "bc"
@@ -55,7 +58,6 @@ paper = 80.67
 [methods."ZeST+DT"]
 agent = "dt"
 goal = "scene"
-context_len = 5
 
 [evaluate]
 n_episodes = 2
@@ -137,6 +139,9 @@ def test_a_recipe_becomes_datasets_policies_a_table_and_a_report(whole: Reproduc
     assert table[4].startswith(f"| ZeST+DT | {value:.2f} | ")
     html = (whole.output / "report.html").read_text()
     assert all(part in html for part in ("A tiny comparison", "ZeST+DT", "Tiny.", "same-scene"))
+    assert artifacts.read_json(cell(whole.output, "dt") / "meta.json")["config"]["context_len"] == 5
+    assert len(list(cell(whole.output, "dt").glob("snapshots/update-000000010/evaluations/*/result.json"))) == 1
+    assert "normalized return, %" in html, "the learning curve"
 
 
 def test_the_table_as_text_shows_every_row_and_goal(whole: Reproduced) -> None:
@@ -243,7 +248,7 @@ def test_whatever_a_result_depends_on_makes_a_cell_of_its_own(whole: Reproduced,
         ('kind = "control"', 'kind = "baseline"', "'kind' must be one of 'method', 'control', got 'baseline'"),
         ("context_len = 5", "contextlen = 5", "unknown key 'contextlen'; did you mean 'context-len'"),
         ("context_len = 5", 'dataset = "zest/x-v0"', "'dataset' is not for a recipe to set"),
-        ('goal = "scene"\ncontext', 'goal = "sceen"\ncontext', "unknown goal 'sceen'; did you mean 'scene'"),
+        ('"dt"\ngoal = "scene"', '"dt"\ngoal = "sceen"', "unknown goal 'sceen'; did you mean 'scene'"),
         ("n_episodes = 2", "n_episodes = 0", "n_episodes must be at least 1, got 0"),
         ("n_episodes = 2", 'rtg = "offline"', "'rtg' must be one of 'online', 'constant', 'schedule', got 'offline'"),
     ],

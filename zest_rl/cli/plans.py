@@ -10,6 +10,7 @@ A recipe has these tables (keys are the flags of the verb)::
     [relabel]                       `zest relabel`, for all goals
     [goals.NAME]                    `zest relabel`, for this goal
     [train]                         `zest train`, for all methods
+    [train.AGENT]                   `zest train AGENT`, for all methods with this agent
     [evaluate]                      `zest evaluate`, for all methods
     [methods."NAME"]                agent = "dt", goal = "NAME" (left out: ground-truth rewards), kind, note, paper,
                                     evaluate = {…} of this method alone, and the agent's own flags
@@ -177,7 +178,7 @@ def _plan_tasks(recipe: Recipe, where: str) -> dict[str, Any]:
 
 
 def _plan_method(recipe: Recipe, method: Mapping[str, Any], goals: Mapping[str, Any], where: str) -> PlannedMethod:
-    from zest_rl.agents import get_agent
+    from zest_rl.agents import AGENTS, get_agent
     from zest_rl.cli import evaluate, train
     from zest_rl.cli.recipes import load_config
 
@@ -188,13 +189,11 @@ def _plan_method(recipe: Recipe, method: Mapping[str, Any], goals: Mapping[str, 
         get_agent(entry.agent)
     if entry.goal is not None and entry.goal not in goals:
         raise BadInput(f"{where}: unknown goal {entry.goal!r}; {nearest(entry.goal, goals)}")
-    training = {
-        "n_updates": 5000,
-        "threads": 1,
-        "device": "cpu",
-        **_table(recipe.train, where, "dataset", "seed", "run_dir"),
-        **_table(flags, where, "dataset", "seed", "run_dir"),
-    }
+    of_agents = {key: table for key, table in recipe.train.items() if key in AGENTS and isinstance(table, dict)}
+    shared = {key: value for key, value in recipe.train.items() if key not in of_agents}
+    training = {"n_updates": 5000, "threads": 1, "device": "cpu"}
+    for table in (shared, of_agents.get(entry.agent, {}), flags):
+        training |= _table(table, where, "dataset", "seed", "run_dir")
     load_config(train.CONFIGS[entry.agent], {**training, "dataset": ""}, where)
     arguments = {**_table(recipe.evaluate, where, "run"), **_table(entry.evaluate, where, "run")}
     config = load_config(evaluate.Config, {**arguments, "run": ""}, f"{where} [evaluate]")
