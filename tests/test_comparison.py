@@ -130,17 +130,31 @@ def test_a_return_curve_holds_the_snapshots_that_were_evaluated_in_every_run(tra
     for run in runs:
         evaluate(run, CONFIG, n_workers=1)
     assert return_curve(method) is None, "without snapshots there is one point only"
+    own = ["snapshots", "metrics.csv", "tb"]
     for run, steps in zip(runs, ((1, 2), (1,)), strict=True):
         for step in steps:
-            snapshot = shutil.copytree(run, run / "snapshots" / f"update-{step:09d}", ignore=lambda *_: ["snapshots"])
+            snapshot = shutil.copytree(run, run / "snapshots" / f"update-{step:09d}", ignore=lambda *_: own)
             edit(snapshot, lambda meta, step=step: meta.update(n_updates=step))  # type: ignore[misc]
-    curve = return_curve(method)
-    assert curve is not None
-    assert curve.steps.tolist() == [1, float(json.loads((runs[0] / "meta.json").read_text())["n_updates"])]
+            (stored,) = snapshot.glob("evaluations/*/result.json")
+            result = json.loads(stored.read_text())
+            for episode in result["episodes"]:
+                episode["gt_return"] -= 10.0 * step
+            stored.write_text(json.dumps(result))
+    evaluate(runs[0] / "snapshots" / "update-000000002", replace(CONFIG, seed=77), n_workers=1)
+    evaluation = latest_evaluation(runs[0])
+    fall = 100 * 10.0 / (evaluation.expert - evaluation.minimum)
     means = [latest_evaluation(run).normalized().mean() for run in runs]
-    np.testing.assert_allclose(curve.values, np.mean(means), rtol=1e-6)
-    assert curve.low is not None
-    np.testing.assert_allclose(curve.low, min(means), rtol=1e-6)
+    for asked in (CONFIG, None):
+        curve = return_curve(replace(method, evaluation=asked))
+        assert curve is not None
+        assert curve.steps.tolist() == [1, float(json.loads((runs[0] / "meta.json").read_text())["n_updates"])]
+        np.testing.assert_allclose(curve.values, [np.mean(means) - fall, np.mean(means)], rtol=1e-5, atol=1e-4)
+        assert curve.low is not None
+        np.testing.assert_allclose(curve.low, [min(means) - fall, min(means)], rtol=1e-5, atol=1e-4)
+    snapshot = runs[0] / "snapshots" / "update-000000001"
+    report = compare("one policy on the way", methods_of_runs([snapshot]), source_id=None, goals={})
+    assert [row.n_episodes for row in report.table] == [2]
+    assert report.curves == (), "a snapshot has no log of its own"
 
 
 def test_too_few_episodes_to_rank_are_no_failure(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -184,6 +184,13 @@ def test_a_deleted_cell_is_run_again_alone_and_to_the_same_numbers(
     assert kept.stat().st_mtime_ns == before
 
 
+def test_a_deleted_evaluation_of_a_snapshot_is_run_again(again: Callable[[], dict[str, Any]], tmp_path: Path) -> None:
+    (snapshot,) = cell(tmp_path / "copy", "dt").glob("snapshots/update-*")
+    shutil.rmtree(snapshot / "evaluations")
+    assert again()["n_cells_run"] == 1
+    assert len(list(snapshot.glob("evaluations/*/result.json"))) == 1
+
+
 def test_a_deleted_evaluation_is_run_again_without_training(
     whole: Reproduced, again: Callable[[], dict[str, Any]], tmp_path: Path
 ) -> None:
@@ -224,6 +231,31 @@ def test_whatever_a_result_depends_on_makes_a_cell_of_its_own(whole: Reproduced,
     assert longer["ZeST+DT"] != first["ZeST+DT"]
 
 
+def test_the_flags_of_a_method_win_over_those_of_its_agent_and_these_over_the_shared(
+    whole: Reproduced, tmp_path: Path
+) -> None:
+    text = RECIPE.replace("seeds = [0]", "seeds = [3, 1]").replace("context_len = 5", "context_len = 5\nn_updates = 21")
+    text += '\n[methods."short DT"]\nagent = "dt"\ngoal = "scene"\nn_updates = 22\n'
+    source = whole.result["tasks"]["micro"]["dataset"]["dataset"]
+    goals = {"scene": next(name for name in data.list_datasets() if "-zest-" in name)}
+    planned = plan_cells(read_plan(write(tmp_path, text)), {"micro": TaskData(source, goals)}, whole.output)
+    assert [(each.train["seed"], each.method, each.train["n_updates"]) for each in planned] == [
+        (3, "BC", 20), (3, "ZeST+DT", 21), (3, "short DT", 22), (1, "BC", 20), (1, "ZeST+DT", 21), (1, "short DT", 22),
+    ], "all of the first seed come first"  # fmt: skip
+
+
+def test_one_task_may_have_several_datasets(tmp_path: Path) -> None:
+    tables = "".join(
+        f"[tasks.at-{level}]\ntask = 'micro'\nlevel = {level}\ndataset = 'zest/at-{level}-v0'\n" for level in (60, 95)
+    )
+    shared = RECIPE.replace('task = "micro"\n', "").replace('dataset = "zest/kitchen-micro-whole-v0"\n', "")
+    plan = read_plan(write(tmp_path, shared.replace("[relabel]", f"{tables}\n[relabel]")))
+    assert {name: (config.task, config.level) for name, config in plan.collect.items()} == {
+        "at-60": ("micro", 60.0),
+        "at-95": ("micro", 95.0),
+    }
+
+
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [
@@ -233,6 +265,8 @@ def test_whatever_a_result_depends_on_makes_a_cell_of_its_own(whole: Reproduced,
         ("seeds = [0]", "seeds = [0, 0]", "seeds must be at least 1 number, all different"),
         ("[relabel]", "[relabel.all]", "[goals.'scene']: unknown key 'all'"),
         ("[methods.BC]", "[methods]", "'methods' must be a table of tables"),
+        ("[train.dt]", "[train.bcc]", "unknown key 'bcc'"),
+        (TASK_AND_SIZE, '[tasks.report]\ntask = "micro"', "the name becomes a file's beside report.html"),
         ("[relabel]", "[tasks.micro]\n[relabel]", "[collect]: 'task' is not for a recipe to set"),
         ('task = "micro"', 'task = "mirco"', "[collect]: unknown task 'mirco'; did you mean 'micro'"),
         ("noise_max = 1.0", "noise_max = 3.0", "[collect]: noise_max must be in [0, 2.0], got 3.0"),
@@ -240,6 +274,8 @@ def test_whatever_a_result_depends_on_makes_a_cell_of_its_own(whole: Reproduced,
         ('goal = "same-scene"', 'goal = "same-scen"', "[goals.'scene']: unknown goal 'same-scen'"),
         ('goal = "same-scene"', 'goal = "visual-tasks:real_imgs"', "set it to your copy of the Visual Tasks Dataset"),
         (TASK_AND_SIZE, "[tasks.micro]\nn_episodes = 3\n[tasks.sdoor]\nn_episodes = 4", "every task needs as many"),
+        (TASK_AND_SIZE, '[tasks."a/b"]\ntask = "micro"', "the name becomes a file's"),
+        (TASK_AND_SIZE, "[tasks.mirco]", "unknown task 'mirco'; did you mean 'micro'"),
         ("noise_max = 1.0", "noise-maxx = 1.0", "[collect]: unknown key 'noise-maxx'; did you mean 'noise-max'"),
         ("n_updates = 20", 'n_updates = "many"', "'n_updates' must be an integer, got 'many'"),
         ("hidden_size = 32", "hidden_size = 0", "hidden_size must be at least 1, got 0"),
@@ -298,7 +334,9 @@ evaluate = {rtg = "constant"}
         assert row["n_episodes"] == sum(of["n_episodes"] for of in of_tasks)
     assert (copy / "table.md").read_text().startswith("| | % of the expert | 95 % interval | micro | sdoor | paper |")
     overview = (copy / "report.html").read_text()
-    assert all(part in overview for part in ('href="micro.html"', 'href="sdoor.html"', "sdoor: scene", "over 2 tasks"))
+    assert all(
+        part in overview for part in ('href="micro.html"', 'href="sdoor.html"', "sdoor: scene", "over 2 datasets")
+    )
     assert "data:video/mp4" in (copy / "sdoor.html").read_text()
     lines = reproduce.summary(result).splitlines()
     assert sum(line.startswith("sdoor: Demo ") for line in lines) == 1

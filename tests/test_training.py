@@ -18,10 +18,12 @@ import torch
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator  # type: ignore[import-untyped]
 
+from zest_rl import training
 from zest_rl.agents import AGENTS, load_policy
 from zest_rl.agents.base import describe_data
 from zest_rl.agents.bc import BCConfig
 from zest_rl.agents.dt import DTConfig
+from zest_rl.checkpoints import TrainState, save_checkpoint, snapshot_folder
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.training import train
 from zest_rl.types import Episode
@@ -142,6 +144,21 @@ def test_snapshots_are_the_policies_of_shorter_trainings(whole: Path, tmp_path: 
     assert (snapshot / "model.safetensors").read_bytes() == (shorter / "model.safetensors").read_bytes()
     policy = load_policy(snapshot)
     assert policy.meta["n_updates"] == 24
+
+
+def test_a_snapshot_that_a_cut_prevented_is_kept_by_the_resumed_run(whole: Path, tmp_path: Path) -> None:
+    """At an update with both, the checkpoint is written last: what goes on from it finds the snapshot there."""
+    seen: list[tuple[bool, bool]] = []
+
+    def look(run: Path, state: TrainState) -> None:
+        folder = snapshot_folder(run, state.update)
+        seen.append((folder.exists(), (run / "checkpoints" / folder.name).exists()))
+        save_checkpoint(run, state)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "save_checkpoint", look)
+        start(tmp_path / "run", whole.name, snapshot_every=7, n_updates=20)
+    assert seen == [(True, False), (True, False)]
 
 
 def test_training_leaves_torchs_generator_and_threads_alone(tmp_path: Path) -> None:

@@ -94,6 +94,16 @@ def _checkpoints(run_dir: Path) -> list[Path]:
     return sorted((run_dir / "checkpoints").glob("update-*"))
 
 
+def snapshot_folder(run_dir: Path, update: int) -> Path:
+    """Where the policy after so many updates is kept, if it is."""
+    return run_dir / "snapshots" / f"update-{update:09d}"
+
+
+def snapshots(run_dir: Path) -> list[Path]:
+    """Folders of the policies that a training kept on its way, the earliest first."""
+    return sorted((run_dir / "snapshots").glob("update-*"))
+
+
 def resume(run_dir: Path, state: TrainState) -> None:
     """Bring `state` and torch's generators to the newest checkpoint, if there is one.
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl import artifacts, data, metrics
+from zest_rl.checkpoints import snapshots
 from zest_rl.errors import BadInput
 from zest_rl.evaluation import Evaluation, EvaluationConfig, check_finished, evaluation_folder, read_evaluation
 from zest_rl.panels import episode_panels, goal_panel, goal_scatter, paired_panels
@@ -70,7 +71,7 @@ def methods_of_runs(runs: Sequence[Path]) -> tuple[Method, ...]:
     for group, seeds in groups.items():
         own = settings[group]
         others = [other for other in settings.values() if other["name"] == own["name"]]
-        telling = [key for key in own if any(other[key] != own[key] for other in others)]
+        telling = [key for key in own if any(other.get(key) != own[key] for other in others)]
         name = ", ".join([own["name"], *(f"{key} {own[key]}" for key in telling)])
         methods.append(Method(name, tuple(seeds.values())))
     return tuple(methods)
@@ -159,18 +160,18 @@ def _row(groups: list[list[NDArray[np.float64]]], success_rate: float, **named: 
     )
 
 
-def snapshots(run: Path) -> list[Path]:
-    """Folders of the policies that a training left on its way, the earliest first."""
-    return sorted((run / "snapshots").glob("update-*"))
-
-
 def return_curve(method: Method) -> Curve | None:
-    """Normalized return over gradient steps, the mean over seeds with their range; None without evaluated snapshots."""
+    """Normalized return over gradient steps, mean and range over seeds; None without snapshots evaluated alike."""
     columns: list[dict[int, float]] = []
     for run in method.runs:
-        evaluated = [folder for folder in snapshots(run) if any(folder.glob("evaluations/*/result.json"))]
-        by_policy = {policy: replace(method, runs=(policy,)).evaluations()[0] for policy in (*evaluated, run)}
-        columns.append({read_meta(p)["n_updates"]: float(e.normalized().mean()) for p, e in by_policy.items()})
+        config = method.evaluation or latest_evaluation(run).config
+        found = {policy: evaluation_folder(policy, config) for policy in (*snapshots(run), run)}
+        returns = {
+            policy: float(read_evaluation(folder).normalized().mean())
+            for policy, folder in found.items()
+            if (folder / "result.json").exists()
+        }
+        columns.append({read_meta(policy)["n_updates"]: value for policy, value in returns.items()})
     steps = sorted(set.intersection(*(set(column) for column in columns)))
     if len(steps) < 2:
         return None
@@ -178,8 +179,10 @@ def return_curve(method: Method) -> Curve | None:
 
 
 def learning_curve(method: Method) -> Curve | None:
-    """Training loss over gradient steps, the mean over seeds with their range."""
+    """Training loss over gradient steps, the mean over seeds with their range; None where it was not logged twice."""
     columns = []
+    if not all((run / "metrics.csv").exists() for run in method.runs):
+        return None  # a snapshot has no log of its own
     for run in method.runs:
         with (run / "metrics.csv").open(newline="") as file:
             columns.append([(float(row["update"]), float(row["loss"])) for row in csv.DictReader(file)])
@@ -300,7 +303,7 @@ def overview(
     rows.insert(0, dataset_row(*sources, paper=paper_demo))
     return Report(
         title=title,
-        summary_sentence=_best_sentence(rows, f" over {len(reports)} tasks"),
+        summary_sentence=_best_sentence(rows, f" over {len(reports)} datasets"),
         table=tuple(rows),
         sections=tuple(Section(task, report.table, pages[task]) for task, report in reports.items()),
         scatters=tuple(
@@ -338,14 +341,11 @@ def _best_sentence(rows: Sequence[MethodRow], where: str = "") -> str:
 
 def _unequal_starts(evaluations: dict[str, list[Evaluation]]) -> list[str]:
     """Say so when methods did not meet the same starts."""
-    starts = {
-        name: {(evaluation.config.seed, evaluation.config.n_episodes) for evaluation in group}
-        for name, group in evaluations.items()
-    }
+    starts = {name: {evaluation.config.starts for evaluation in group} for name, group in evaluations.items()}
     if len(set().union(*starts.values())) == 1:
         return []
     listed = "; ".join(
-        f"{name}: {' and '.join(f'{n} from seed {seed}' for seed, n in sorted(group))}"
+        f"{name}: {' and '.join(sorted(f'{len(seeds)} from seed {seeds.start}' for seeds in group))}"
         for name, group in starts.items()
     )
     return [f"The methods were not evaluated on the same starts, so their numbers are not paired ({listed})."]

@@ -47,6 +47,11 @@ class EvaluationConfig:
     target_quantile: float = 1.0
     """The target return is this quantile of the training returns: a rule fixed before evaluation."""
 
+    @property
+    def starts(self) -> range:
+        """The seeds of the environment's resets, one per episode."""
+        return range(self.seed, self.seed + self.n_episodes)
+
     def __post_init__(self) -> None:
         problems = []
         if self.n_episodes < 1:
@@ -226,7 +231,7 @@ def evaluate(
     n_workers: int | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> Evaluation:
-    """Evaluate the last checkpoint of a run; finished parts are kept, so a cut evaluation goes on where it stopped.
+    """Evaluate the policy that a run ended with; finished parts are kept, so a cut evaluation goes on where it stopped.
 
     Args:
         run: folder that `zest_rl.training.train` left, with the dataset's entry in its meta.

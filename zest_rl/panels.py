@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl import data, metrics
+from zest_rl import artifacts, data, metrics
 from zest_rl.evaluation import Evaluation, evaluation_folder
 from zest_rl.images import list_images, read_image
 from zest_rl.relabel import GOAL_FOLDER
@@ -73,15 +73,16 @@ def paired_panels(left: tuple[str, Evaluation], right: tuple[str, Evaluation]) -
         right: of the other; without equal starts there is nothing to pair, and the list is empty.
     """
     (left_name, one), (right_name, other) = left, right
-    if (one.config.seed, one.config.n_episodes) != (other.config.seed, other.config.n_episodes):
+    if one.config.starts != other.config.starts:
         return []
     panels = []
     before, after = one.normalized(), other.normalized()
     for which, index in representative(after - before).items():
-        folder = evaluation_folder(other.run, other.config)
-        video = folder / f"{which}-gain-over-{one.run.name}-{evaluation_folder(one.run, one.config).name}.mp4"
+        before_qpos, after_qpos = one.traces["qpos"][index], other.traces["qpos"][index]
+        name = f"pair-{artifacts.hash_arrays(before_qpos, after_qpos)[:8]}.mp4"
+        video = evaluation_folder(other.run, other.config) / name
         if not video.exists():
-            write_video(one.traces["qpos"][index], video, beside=other.traces["qpos"][index])
+            write_video(before_qpos, video, beside=after_qpos)
         panels.append(
             EpisodePanel(
                 title=f"{left_name} (left, {before[index]:.0f} %) beside {right_name} (right): {which} gain",

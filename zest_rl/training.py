@@ -37,7 +37,7 @@ from torch.utils.tensorboard import SummaryWriter
 from zest_rl import artifacts
 from zest_rl.agents import get_agent
 from zest_rl.agents.base import DataFacts, Rules, autocast, check_fields, describe_data, resolve_precision
-from zest_rl.checkpoints import TrainState, resume, save_checkpoint
+from zest_rl.checkpoints import TrainState, resume, save_checkpoint, snapshot_folder
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.types import Episode
 
@@ -121,7 +121,7 @@ def train(
                         return definition.loss(state.model, batch)
 
                 def keep_snapshot() -> None:
-                    folder = run_dir / "snapshots" / f"update-{state.update:09d}"
+                    folder = snapshot_folder(run_dir, state.update)
                     if not folder.exists():
                         with artifacts.staged_folder(folder) as staging:
                             _write_policy(staging, state, request | {"n_updates": state.update}, facts)
@@ -197,11 +197,11 @@ def _fit(
                 state.recent, row_update, row_tick = [], state.update, now
                 if on_progress is not None:
                     on_progress(state.update, row)
-            if state.update % arguments.checkpoint_every == 0 and state.update < arguments.n_updates:
-                save_checkpoint(run_dir, state)
             every = arguments.snapshot_every
             if every is not None and state.update % every == 0 and state.update < arguments.n_updates:
-                keep_snapshot()
+                keep_snapshot()  # before the checkpoint: a run that goes on from there does not come by here again
+            if state.update % arguments.checkpoint_every == 0 and state.update < arguments.n_updates:
+                save_checkpoint(run_dir, state)
 
 
 @contextmanager

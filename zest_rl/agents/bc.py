@@ -63,7 +63,8 @@ class BCConfig:
     grad_clip: float = 0.25
     """Largest Euclidean norm of the gradient."""
     ema_decay: float = 0.999
-    """Decay of the moving average of the weights, which is what acts; 0 acts with the last weights."""
+    """Largest decay of the moving average of the weights, which is what acts; 0 acts with the last weights. It rises as
+    (1 + n) / (10 + n): about the last ninth of a training is averaged, until 0.999 is reached after 9000 updates."""
     amp: Precision = "auto"
     """Precision of matrix products; auto is bf16 where the hardware has it."""
 

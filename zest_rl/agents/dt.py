@@ -77,7 +77,8 @@ class DTConfig:
     grad_clip: float = 0.25
     """Largest Euclidean norm of the gradient."""
     ema_decay: float = 0.999
-    """Decay of the moving average of the weights, which is what acts; 0 acts with the last weights."""
+    """Largest decay of the moving average of the weights, which is what acts; 0 acts with the last weights. It rises as
+    (1 + n) / (10 + n): about the last ninth of a training is averaged, until 0.999 is reached after 9000 updates."""
     amp: Precision = "auto"
     """Precision of matrix products; auto is bf16 where the hardware has it."""
 
@@ -255,7 +256,7 @@ class DTPolicy:
         """Return actions (N, act_dim) float32 in [-1, 1] for obs (N, obs_dim) float32, the newest of each episode.
 
         Raises:
-            BadInput: the shape is wrong, or the episode outlasts the longest one of the training data.
+            BadInput: the shape is wrong, or the episode outlasts the longest of the data and timesteps are absolute.
         """
         check_obs(obs, len(self._remaining), self._facts.obs_dim)
         bound = self._facts.max_steps

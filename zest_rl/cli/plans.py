@@ -6,7 +6,8 @@ A recipe has these tables (keys are the flags of the verb)::
     seeds = [0, 1, 2]               training seeds, one cell per task, method and seed
     caveats = ["…"]                 sentences at the end of the report
     [collect]                       `zest collect`, for all tasks
-    [tasks.NAME]                    `zest collect`, for this task; left out: the one task of [collect]
+    [tasks.NAME]                    `zest collect`, for this task; left out: the one task of [collect]. With a key
+                                    task = "…" the name is free, and one task may have several datasets
     [relabel]                       `zest relabel`, for all goals
     [goals.NAME]                    `zest relabel`, for this goal
     [train]                         `zest train`, for all methods
@@ -20,9 +21,11 @@ Methods that differ in their evaluation alone share their trained policies.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -145,11 +148,18 @@ def read_plan(path: Path) -> Plan:
         name: _plan_method(recipe, method, goals, f"recipe {path} [methods.{name!r}]")
         for name, method in recipe.methods.items()
     }
+    unused = {key for key, table in recipe.train.items() if isinstance(table, dict)} - {
+        method.entry.agent for method in methods.values()
+    }
+    if unused:
+        raise BadInput(
+            f"recipe {path} [train]: no method has the agent {', '.join(sorted(unused))}; leave its table out"
+        )
     collected = _plan_tasks(recipe, f"recipe {path}")
     for name, config in goals.items():
-        for task in collected:
+        for collect_config in collected.values():
             with _at(f"recipe {path} [goals.{name!r}]"):
-                goal_folder(config.goal, get_task(task))
+                goal_folder(config.goal, get_task(collect_config.task))
     return Plan(recipe, collected, goals, methods)
 
 
@@ -158,23 +168,29 @@ def _plan_tasks(recipe: Recipe, where: str) -> dict[str, Any]:
     from zest_rl.cli.recipes import load_config
 
     if not recipe.tasks:
-        collected = [load_config(Config, recipe.collect, f"{where} [collect]")]
+        config = load_config(Config, recipe.collect, f"{where} [collect]")
+        collected = {config.task: config}
     else:
         shared = _table(recipe.collect, f"{where} [collect]", "task")
-        collected = []
-        for task, table in recipe.tasks.items():
-            here = f"{where} [tasks.{task}]"
-            collected.append(load_config(Config, {**shared, **_table(table, here, "task"), "task": task}, here))
-    sizes, ids = {config.n_episodes for config in collected}, {config.dataset_id for config in collected}
+        collected = {}
+        for name, table in recipe.tasks.items():
+            here = f"{where} [tasks.{name}]"
+            collected[name] = load_config(Config, {**shared, "task": name, **_table(table, here)}, here)
+    sizes, ids = {config.n_episodes for config in collected.values()}, {c.dataset_id for c in collected.values()}
     if len(sizes) > 1 or len(ids) < len(collected):
         raise BadInput(
             f"{where} [tasks]: every task needs as many episodes and a dataset of its own, got n_episodes "
-            f"{sorted(sizes)} and datasets {sorted(ids)}; let the dataset's id in [collect] hold {{task}}"
+            f"{sorted(sizes)} and datasets {sorted(ids)}; let the dataset's id in [collect] hold {{task}}, or give "
+            "each [tasks.NAME] its own"
         )
-    for config in collected:
+    for name, config in collected.items():
+        if not re.fullmatch(r"[A-Za-z0-9_-]+", name) or name == "report":
+            raise BadInput(
+                f"{where} [tasks.{name!r}]: the name becomes a file's beside report.html; use letters, digits, - and _"
+            )
         with _at(f"{where} [{'tasks' if recipe.tasks else 'collect'}]"):
             config.behaviour()
-    return {config.task: config for config in collected}
+    return collected
 
 
 def _plan_method(recipe: Recipe, method: Mapping[str, Any], goals: Mapping[str, Any], where: str) -> PlannedMethod:
@@ -221,30 +237,34 @@ def _table(values: Mapping[str, Any], where: str, *given: str) -> dict[str, Any]
 
 
 def plan_cells(plan: Plan, datasets: Mapping[str, TaskData], output: Path) -> list[Cell]:
-    """Return one cell per task, method and seed; the run's folder is named by a hash of its data and arguments."""
+    """Return one cell per task, method and seed; the run's folder is named by a hash of its data and all arguments.
+
+    All cells of the first seed come first: of what was cut short, a recipe with fewer seeds finds its cells done.
+    """
     from zest_rl import artifacts, data
+    from zest_rl.cli import train
+    from zest_rl.cli.recipes import load_config
 
     described = {
         name: data.describe(name) for task in datasets.values() for name in (task.source, *task.by_goal.values())
     }
     cells = []
-    for task, of_task in datasets.items():
-        for name, method in plan.methods.items():
-            goal, agent = method.entry.goal, method.entry.agent
-            dataset = of_task.source if goal is None else of_task.by_goal[goal]
-            for seed in plan.recipe.seeds:
-                table = {**method.training, "dataset": dataset, "seed": seed}
-                digest = artifacts.hash_json([table, agent, described[dataset]])
-                run = output / "cells" / f"{task}-{agent}-{goal or 'ground-truth'}-seed{seed}-{digest[:8]}"
-                cells.append(
-                    Cell(
-                        task,
-                        name,
-                        run,
-                        agent,
-                        {**table, "run_dir": str(run)},
-                        {**method.evaluate, "run": str(run)},
-                        method.evaluation,
-                    )
-                )
+    for seed, (name, method), (task, of_task) in product(plan.recipe.seeds, plan.methods.items(), datasets.items()):
+        goal, agent = method.entry.goal, method.entry.agent
+        dataset = of_task.source if goal is None else of_task.by_goal[goal]
+        table = {**method.training, "dataset": dataset, "seed": seed}
+        arguments = asdict(load_config(train.CONFIGS[agent], table, name))  # defaults are arguments, too
+        digest = artifacts.hash_json([arguments, agent, described[dataset]])
+        run = output / "cells" / f"{task}-{agent}-{goal or 'ground-truth'}-seed{seed}-{digest[:8]}"
+        cells.append(
+            Cell(
+                task,
+                name,
+                run,
+                agent,
+                {**table, "run_dir": str(run)},
+                {**method.evaluate, "run": str(run)},
+                method.evaluation,
+            )
+        )
     return cells

@@ -215,9 +215,9 @@ def markdown(result: Mapping[str, Any]) -> str:
 def _work(cell: Cell) -> dict[str, Any]:
     import numpy as np
 
+    from zest_rl.checkpoints import snapshots
     from zest_rl.cli import evaluate, train
     from zest_rl.cli.recipes import load_config
-    from zest_rl.comparison import snapshots
 
     train.run(load_config(train.CONFIGS[cell.agent], cell.train, cell.method), SilentUi())
     trained = time.monotonic()
@@ -243,11 +243,13 @@ def run_cells(cells: list[Cell], output: Path, ui: Ui, *, n_workers: int | None 
 
 def _is_done(cell: Cell, folder: Path) -> bool:
     """Whether a cell's results are there; a marker without them is removed, so that the cell is run again."""
+    from zest_rl.checkpoints import snapshots
     from zest_rl.evaluation import evaluation_folder
 
     marker = folder / f"{cell.name}.npz"
-    results = (cell.run / "meta.json", evaluation_folder(cell.run, cell.evaluation) / "result.json")
-    if not all(path.exists() for path in results):
+    policies = (cell.run, *snapshots(cell.run))
+    results = [evaluation_folder(policy, cell.evaluation) / "result.json" for policy in policies]
+    if not all(path.exists() for path in (cell.run / "meta.json", *results)):
         marker.unlink(missing_ok=True)
     return marker.exists()
 

@@ -73,6 +73,7 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
 def train_on_dataset(config: Arguments, agent_config: Any, run_dir: Path, ui: Ui) -> dict[str, Any]:
     """Train `agent_config` on a dataset and leave its scorer, if it has one, in the run folder; return the meta."""
     from zest_rl import artifacts, data
+    from zest_rl.checkpoints import snapshots
     from zest_rl.relabel import SCORER_FILE
     from zest_rl.training import train
 
@@ -102,7 +103,7 @@ def train_on_dataset(config: Arguments, agent_config: Any, run_dir: Path, ui: Ui
         )
     scorer = data.dataset_path(config.dataset) / SCORER_FILE
     if scorer.exists():
-        for folder in (run_dir, *run_dir.glob("snapshots/*")):
+        for folder in (run_dir, *snapshots(run_dir)):
             artifacts.write_bytes(folder / SCORER_FILE, scorer.read_bytes())
     meta: dict[str, Any] = artifacts.read_json(run_dir / "meta.json")
     return meta
