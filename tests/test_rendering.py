@@ -116,13 +116,15 @@ def test_frames_are_upright(start: NDArray[np.float64]) -> None:
 def test_every_view_of_a_task_shows_its_part_moving(
     task: rendering.Task, physics: mujoco.MjModel, start: NDArray[np.float64]
 ) -> None:
-    moved = start.copy()
-    moved[physics.joint(task.joint).qposadr[0]] = task.goal
-    for equality in range(physics.neq):  # the burner rises with its knob
-        if physics.eq_obj1id[equality] == physics.joint(task.joint).id:
-            moved[physics.jnt_qposadr[physics.eq_obj2id[equality]]] = -0.009
     with StateRenderer(RenderConfig(size=112), ring(task, 8)) as renderer:
+        moved = renderer.with_joint(start, task.joint, task.goal)
         change = np.abs(renderer.render(moved).astype(int) - renderer.render(start)).max(axis=-1) > 20
+    assert moved[physics.joint(task.joint).qposadr[0]] == task.goal
+    for equality in range(physics.neq):  # the burner rises with its knob
+        knob, burner = physics.eq_obj1id[equality], physics.eq_obj2id[equality]
+        if knob == physics.joint(task.joint).id:
+            risen = moved[physics.jnt_qposadr[burner]]
+            np.testing.assert_allclose(physics.eq_data[equality, 1] * risen, task.goal, rtol=1e-9)
     assert (change.mean(axis=(1, 2)) > 0.001).all(), "share of pixels that change, per view"
     assert not change[:, 0].any(), "the moving part stays below the upper edge"
 

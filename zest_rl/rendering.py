@@ -181,9 +181,20 @@ class StateRenderer:
         return np.ascontiguousarray(frames[:, ::-1])  # GL counts rows from the bottom
 
     def with_joint(self, qpos: NDArray[np.float64], joint: str, position: float) -> NDArray[np.float64]:
-        """Return a copy of a state (30,) with one of the objects' joints moved to `position` (rad or m)."""
+        """Return a copy of a state (30,) with one of the objects' joints moved to `position` (rad or m).
+
+        What the model couples to the joint moves along: a burner rises, and so turns red, with its knob.
+        """
+        model, first = self._model, self._relevant.start
+        mover = model.joint(joint).id
         moved = qpos.copy()
-        moved[self._relevant.start + self._model.jnt_qposadr[self._model.joint(joint).id]] = position
+        moved[first + model.jnt_qposadr[mover]] = position
+        coupled = (model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & (model.eq_obj1id == mover)
+        for equality in np.flatnonzero(coupled):  # mover = offset + slope · follower, both from their rest positions
+            offset, slope = model.eq_data[equality, :2]
+            address = model.jnt_qposadr[model.eq_obj2id[equality]]
+            rest = model.qpos0[model.jnt_qposadr[mover]]
+            moved[first + address] = model.qpos0[address] + (position - rest - offset) / slope
         return moved
 
     def close(self) -> None:
