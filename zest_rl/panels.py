@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,7 @@ from zest_rl.images import list_images, read_image
 from zest_rl.relabel import GOAL_FOLDER
 from zest_rl.report import EpisodePanel, GoalPanel, Scatter
 from zest_rl.scorer import Scorer
+from zest_rl.types import FloatArray
 from zest_rl.videos import FPS, representative, write_video
 
 MIN_EPISODES_TO_RANK = 3
@@ -43,26 +46,31 @@ def episode_panels(name: str, evaluation: Evaluation, scorer: Scorer | None) -> 
     """Best, median and worst episode of an evaluation: video, score over time, ground-truth progress."""
     panels = []
     folder = evaluation_folder(evaluation.run, evaluation.config)
-    values = evaluation.normalized()
-    for which, index in representative(values).items():
+    for which, index in representative(evaluation.normalized()).items():
         states: NDArray[np.float64] = evaluation.traces["qpos"][index]
         video = folder / f"{which}.mp4"
         if not video.exists():
             write_video(states, video)
-        panels.append(
-            EpisodePanel(
-                title=f"{name}: {which}",
-                method=name,
-                seed=evaluation.episodes[index].seed,
-                normalized_return=float(values[index]),
-                success=evaluation.episodes[index].success,
-                video=video,
-                fps=FPS,
-                gt_progress=np.asarray(evaluation.traces["gt_reward"][index], dtype=np.float32),
-                scores=None if scorer is None else scorer.score_episodes([states])[0][0],
-            )
-        )
+        panel = _panel(f"{name}: {which}", name, evaluation, index, video)
+        panels.append(replace(panel, scores=None if scorer is None else scorer.score_episodes([states])[0][0]))
     return panels
+
+
+def _panel(title: str, name: str, evaluation: Evaluation, index: int, video: Path) -> EpisodePanel:
+    return EpisodePanel(
+        title=title,
+        method=name,
+        seed=evaluation.episodes[index].seed,
+        normalized_return=float(evaluation.normalized()[index]),
+        success=evaluation.episodes[index].success,
+        video=video,
+        fps=FPS,
+        gt_progress=_progress(evaluation, index),
+    )
+
+
+def _progress(evaluation: Evaluation, index: int) -> FloatArray:
+    return np.asarray(evaluation.traces["gt_reward"][index], dtype=np.float32)
 
 
 def paired_panels(left: tuple[str, Evaluation], right: tuple[str, Evaluation]) -> list[EpisodePanel]:
@@ -83,17 +91,7 @@ def paired_panels(left: tuple[str, Evaluation], right: tuple[str, Evaluation]) -
         video = evaluation_folder(other.run, other.config) / name
         if not video.exists():
             write_video(before_qpos, video, beside=after_qpos)
-        panels.append(
-            EpisodePanel(
-                title=f"{left_name} (left, {before[index]:.0f} %) beside {right_name} (right): {which} gain",
-                method=right_name,
-                seed=other.episodes[index].seed,
-                normalized_return=float(after[index]),
-                success=other.episodes[index].success,
-                video=video,
-                fps=FPS,
-                gt_progress=np.asarray(other.traces["gt_reward"][index], dtype=np.float32),
-                beside=(left_name, np.asarray(one.traces["gt_reward"][index], dtype=np.float32)),
-            )
-        )
+        title = f"{left_name} (left, {before[index]:.0f} %) beside {right_name} (right): {which} gain"
+        panel = _panel(title, right_name, other, index, video)
+        panels.append(replace(panel, beside=(left_name, _progress(one, index))))
     return panels
