@@ -115,7 +115,7 @@ def trained(trained_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 @pytest.fixture(scope="module")
 def short_videos() -> Iterator[None]:
     """Write the first 2 states of a video only."""
-    from zest_rl import panels, videos
+    from zest_rl import videos
 
     write_video = videos.write_video
 
@@ -124,7 +124,6 @@ def short_videos() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(videos, "write_video", short_video)
-        patch.setattr(panels, "write_video", short_video)
         yield
 
 

@@ -162,6 +162,8 @@ def _row(groups: list[list[NDArray[np.float64]]], success_rate: float, **named: 
 
 def return_curve(method: Method) -> Curve | None:
     """Normalized return over gradient steps, mean and range over seeds; None without snapshots evaluated alike."""
+    if not all(map(snapshots, method.runs)):
+        return None
     columns: list[dict[int, float]] = []
     for run in method.runs:
         config = method.evaluation or latest_evaluation(run).config

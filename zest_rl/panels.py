@@ -16,7 +16,7 @@ from zest_rl.relabel import GOAL_FOLDER
 from zest_rl.report import EpisodePanel, GoalPanel, Scatter
 from zest_rl.scorer import Scorer
 from zest_rl.types import FloatArray
-from zest_rl.videos import FPS, representative, write_video
+from zest_rl.videos import FPS, ensure_video, representative
 
 MIN_EPISODES_TO_RANK = 3
 
@@ -48,9 +48,7 @@ def episode_panels(name: str, evaluation: Evaluation, scorer: Scorer | None) -> 
     folder = evaluation_folder(evaluation.run, evaluation.config)
     for which, index in representative(evaluation.normalized()).items():
         states: NDArray[np.float64] = evaluation.traces["qpos"][index]
-        video = folder / f"{which}.mp4"
-        if not video.exists():
-            write_video(states, video)
+        video = ensure_video(states, folder / f"{which}.mp4")
         panel = _panel(f"{name}: {which}", name, evaluation, index, video)
         panels.append(replace(panel, scores=None if scorer is None else scorer.score_episodes([states])[0][0]))
     return panels
@@ -88,9 +86,7 @@ def paired_panels(left: tuple[str, Evaluation], right: tuple[str, Evaluation]) -
     for which, index in representative(after - before).items():
         before_qpos, after_qpos = one.traces["qpos"][index], other.traces["qpos"][index]
         name = f"pair-{artifacts.hash_arrays(before_qpos, after_qpos)[:8]}.mp4"
-        video = evaluation_folder(other.run, other.config) / name
-        if not video.exists():
-            write_video(before_qpos, video, beside=after_qpos)
+        video = ensure_video(before_qpos, evaluation_folder(other.run, other.config) / name, beside=after_qpos)
         title = f"{left_name} (left, {before[index]:.0f} %) beside {right_name} (right): {which} gain"
         panel = _panel(title, right_name, other, index, video)
         panels.append(replace(panel, beside=(left_name, _progress(one, index))))

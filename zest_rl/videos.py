@@ -43,6 +43,11 @@ def write_video(
     return path
 
 
+def ensure_video(states: NDArray[np.float64], path: Path, *, beside: NDArray[np.float64] | None = None) -> Path:
+    """Return `path`, after `write_video` if nothing is there yet."""
+    return path if path.exists() else write_video(states, path, beside=beside)
+
+
 def representative(returns: NDArray[np.float64]) -> dict[str, int]:
     """Indices of the best, the median and the worst episode by return; ties go to the earlier one."""
     order = np.argsort(-np.asarray(returns), kind="stable")

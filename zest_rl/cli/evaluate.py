@@ -44,7 +44,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     import time
 
     from zest_rl.evaluation import evaluate, evaluation_folder
-    from zest_rl.videos import representative, write_video
+    from zest_rl.videos import ensure_video, representative
 
     started = time.monotonic()
     what = settings(config)
@@ -63,7 +63,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     if config.videos:
         for name, index in representative(result.normalized()).items():
             path = folder / f"{name}.mp4"
-            videos[name] = str(path if path.exists() else write_video(result.traces["qpos"][index], path))
+            videos[name] = str(ensure_video(result.traces["qpos"][index], path))
     return {
         "run": str(config.run),
         **result.summary(),
