@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import settings
 
@@ -119,8 +118,9 @@ def short_videos() -> Iterator[None]:
 
     write_video = videos.write_video
 
-    def short_video(states: np.ndarray, path: Path, *, beside: np.ndarray | None = None) -> Path:
-        return write_video(states[:2], path, beside=None if beside is None else beside[:2], size=64)
+    def short_video(video: videos.Video) -> Path:
+        beside = None if video.beside is None else video.beside[:2]
+        return write_video(videos.Video(video.states[:2], video.path, beside), size=64)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(videos, "write_video", short_video)

@@ -27,6 +27,7 @@ from zest_rl.comparison import (
 from zest_rl.errors import BadInput
 from zest_rl.evaluation import EvaluationConfig, evaluate
 from zest_rl.panels import goal_panel, goal_scatter, paired_panels
+from zest_rl.videos import Video
 
 CONFIG = EvaluationConfig(n_episodes=2, seed=11, rtg="constant")
 
@@ -120,8 +121,16 @@ def test_a_goal_is_judged_by_how_its_returns_rank_the_episodes(trained: Path) ->
 def test_policies_are_shown_side_by_side_only_on_equal_starts(evaluated: Path) -> None:
     clone, other = (latest_evaluation(evaluated / name) for name in ("bc-0", "dt-0"))
     elsewhere = replace(other, config=replace(other.config, seed=99))
-    assert len(paired_panels(("BC", clone), ("DT", other))) == 3
-    assert paired_panels(("BC", clone), ("DT", elsewhere)) == []
+    videos: list[Video] = []
+
+    def film(video: Video) -> Path:
+        videos.append(video)
+        return video.path
+
+    assert [panel.video for panel in paired_panels(("BC", clone), ("DT", other), film)] == [v.path for v in videos]
+    assert len(videos) == 3
+    assert all(video.beside is not None for video in videos)
+    assert paired_panels(("BC", clone), ("DT", elsewhere), film) == []
 
 
 def test_a_return_curve_holds_the_snapshots_that_were_evaluated_in_every_run(trained: Path) -> None:

@@ -156,8 +156,8 @@ def test_two_worker_processes_give_the_bits_of_one_and_end_quietly(
 
 def test_a_process_that_rendered_ends_quietly() -> None:
     code = (
-        "import numpy as np; from zest_rl.embed import shared_renderer; from zest_rl.frames import Views\n"
-        "for size in (32, 64): print(shared_renderer(Views('micro', n_views=1, size=size)).render(np.zeros(30)).shape)"
+        "import numpy as np; from zest_rl.frames import Views\n"
+        "for size in (32, 64): print(Views('micro', n_views=1, size=size).shared_renderer().render(np.zeros(30)).shape)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")

@@ -10,7 +10,7 @@ import pytest
 
 from zest_rl import data
 from zest_rl.rendering import RenderConfig, StateRenderer
-from zest_rl.videos import FPS, SCENE, representative, write_video
+from zest_rl.videos import FPS, SCENE, Video, ensure_videos, representative, write_video
 
 N_FRAMES = 8
 
@@ -22,7 +22,7 @@ def states(collected: str) -> np.ndarray:
 
 
 def test_a_video_is_h264_with_one_frame_per_state_and_shows_the_states(states: np.ndarray, tmp_path: Path) -> None:
-    path = write_video(states, tmp_path / "videos" / "best.mp4", size=160)
+    path = write_video(Video(states, tmp_path / "videos" / "best.mp4"), size=160)
     with imageio.get_reader(path) as reader:
         meta, frames = reader.get_meta_data(), np.stack([np.asarray(frame) for frame in reader.iter_data()])
     assert meta["codec"] == "h264"
@@ -37,7 +37,7 @@ def test_a_video_is_h264_with_one_frame_per_state_and_shows_the_states(states: n
 
 
 def test_two_episodes_are_shown_side_by_side(states: np.ndarray, tmp_path: Path) -> None:
-    path = write_video(states[:3], tmp_path / "pair.mp4", beside=states[::-1][:3], size=96)
+    path = write_video(Video(states[:3], tmp_path / "pair.mp4", beside=states[::-1][:3]), size=96)
     frames = np.stack([np.asarray(frame) for frame in imageio.mimread(path)]).astype(float)
     assert frames.shape == (3, 96, 192, 3)
     with StateRenderer(RenderConfig(size=96, robot=True), (SCENE,)) as renderer:
@@ -49,8 +49,19 @@ def test_two_episodes_are_shown_side_by_side(states: np.ndarray, tmp_path: Path)
 def test_a_video_can_be_written_over_an_old_one(states: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     path.write_bytes(b"not a video")
-    write_video(states[:2], path, size=64)
+    write_video(Video(states[:2], path), size=64)
     assert imageio.mimread(path)[0].shape == (64, 64, 3)
+
+
+def test_videos_are_written_side_by_side_and_those_that_are_there_are_left(states: np.ndarray, tmp_path: Path) -> None:
+    videos = [Video(states[i : i + 2], tmp_path / f"{i}.mp4") for i in (0, 1, 2, 1)]
+    videos[0].path.write_bytes(b"made before")
+    done: list[None] = []
+    ensure_videos(videos, n_workers=2, on_done=lambda: done.append(None))
+    assert len(done) == 3
+    assert videos[0].path.read_bytes() == b"made before"
+    assert [len(imageio.mimread(video.path)) for video in videos[1:]] == [2, 2, 2]
+    assert {path.name for path in tmp_path.glob("*.mp4*")} == {"0.mp4", "1.mp4", "2.mp4"}
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from zest_rl.relabel import SCORER_FILE
 from zest_rl.report import Curve, MethodRow, Report, Section
 from zest_rl.report.data import Kind
 from zest_rl.scorer import Scorer
+from zest_rl.videos import Film, ensure_video
 
 
 @dataclass(frozen=True)
@@ -222,6 +223,7 @@ def compare(
     paper_demo: float | None = None,
     caveats: Sequence[str] = (),
     details: dict[str, Any] | None = None,
+    film: Film = ensure_video,
 ) -> Report:
     """Build the report of several methods on one task.
 
@@ -233,6 +235,7 @@ def compare(
         paper_demo: the paper's figure for "Demo", in percent.
         caveats: sentences shown at the end.
         details: shown as collapsed JSON, beside the runs' own meta.
+        film: makes the episodes' videos.
 
     Raises:
         BadInput: a run was not evaluated, or is of another task than the others.
@@ -250,15 +253,14 @@ def compare(
     if goals:
         scorer = Scorer.load(data.dataset_path(next(iter(goals.values()))) / SCORER_FILE)
     shown = [method for method in methods if method.kind == "method"]
-    panels = [p for m in shown for p in episode_panels(m.name, evaluations[m.name][0], scorer)]
+    panels = [p for m in shown for p in episode_panels(m.name, evaluations[m.name][0], scorer, film)]
     if scorer is not None:
         scorer.states.flush()
     cloned = next((method.name for method in shown if _agent(metas, method) == "bc"), None)
     if cloned is not None:
+        first = {name: (name, of_seeds[0]) for name, of_seeds in evaluations.items()}
         others = [method.name for method in shown if _agent(metas, method) != "bc"]
-        panels += [
-            p for name in others for p in paired_panels((cloned, evaluations[cloned][0]), (name, evaluations[name][0]))
-        ]
+        panels += [p for name in others for p in paired_panels(first[cloned], first[name], film)]
     return Report(
         title=title,
         summary_sentence=_best_sentence(rows),

@@ -9,7 +9,6 @@ embedded beside it: networks are exact only up to about 1e-6 across batch sizes 
 
 from __future__ import annotations
 
-import atexit
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +21,6 @@ from zest_rl import artifacts
 from zest_rl.embedders import Embedder, Precision, load_embedder
 from zest_rl.frames import Views, canonical_states, state_keys
 from zest_rl.parallel import chunks, map_jobs, one_thread, read_arrays, write_arrays
-from zest_rl.rendering import StateRenderer
 from zest_rl.types import FloatArray
 
 STATES_PER_SHARD = 32
@@ -43,14 +41,6 @@ class EmbedConfig:
         return _embedder(self.embedder, self.precision, self.device)
 
 
-@functools.cache
-def shared_renderer(views: Views) -> StateRenderer:
-    """Return this process's renderer of `views`, open until the process ends: to build one takes half a second."""
-    renderer = views.renderer()
-    atexit.register(renderer.close)  # left open, or closed after the GL library, it complains when the process ends
-    return renderer
-
-
 @functools.lru_cache(maxsize=2)
 def _embedder(uri: str, precision: Precision, device: str) -> Embedder:
     return load_embedder(uri, device=device, precision=precision)
@@ -58,7 +48,7 @@ def _embedder(uri: str, precision: Precision, device: str) -> Embedder:
 
 def _embed_states(job: tuple[EmbedConfig, NDArray[np.float64]]) -> dict[str, NDArray[np.generic]]:
     config, states = job
-    renderer, embedder = shared_renderer(config.views), config.load_embedder()
+    renderer, embedder = config.views.shared_renderer(), config.load_embedder()
     with one_thread():
         embeddings = [embedder.embed_images(list(renderer.render(state))) for state in states]
     return {"keys": states, "embeddings": np.stack(embeddings)}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from zest_rl import artifacts
 from zest_rl.errors import BadInput
-from zest_rl.rendering import Camera, RenderConfig, StateRenderer, relevant_qpos, ring
+from zest_rl.rendering import Camera, RenderConfig, StateRenderer, relevant_qpos, ring, shared_renderer
 from zest_rl.tasks import Task, get_task
 
 
@@ -53,6 +53,10 @@ class Views:
     def renderer(self) -> StateRenderer:
         """Open a renderer of these views; close it after use."""
         return StateRenderer(self.render_config, self.cameras)
+
+    def shared_renderer(self) -> StateRenderer:
+        """Return this process's renderer of these views; never close it."""
+        return shared_renderer(self.render_config, self.cameras)
 
 
 def canonical_states(qpos: NDArray[np.float64], views: Views) -> NDArray[np.float64]:

@@ -16,7 +16,7 @@ from zest_rl.relabel import GOAL_FOLDER
 from zest_rl.report import EpisodePanel, GoalPanel, Scatter
 from zest_rl.scorer import Scorer
 from zest_rl.types import FloatArray
-from zest_rl.videos import FPS, ensure_video, representative
+from zest_rl.videos import FPS, Film, Video, representative
 
 MIN_EPISODES_TO_RANK = 3
 
@@ -42,13 +42,13 @@ def goal_panel(name: str, dataset_id: str, scatter: Scatter) -> GoalPanel:
     return GoalPanel(name, (sides[0],), (sides[-1],), scatter.spearman, len(scatter.gt_returns))
 
 
-def episode_panels(name: str, evaluation: Evaluation, scorer: Scorer | None) -> list[EpisodePanel]:
+def episode_panels(name: str, evaluation: Evaluation, scorer: Scorer | None, film: Film) -> list[EpisodePanel]:
     """Best, median and worst episode of an evaluation: video, score over time, ground-truth progress."""
     panels = []
     folder = evaluation_folder(evaluation.run, evaluation.config)
     for which, index in representative(evaluation.normalized()).items():
         states: NDArray[np.float64] = evaluation.traces["qpos"][index]
-        video = ensure_video(states, folder / f"{which}.mp4")
+        video = film(Video(states, folder / f"{which}.mp4"))
         panel = _panel(f"{name}: {which}", name, evaluation, index, video)
         panels.append(replace(panel, scores=None if scorer is None else scorer.score_episodes([states])[0][0]))
     return panels
@@ -71,12 +71,13 @@ def _progress(evaluation: Evaluation, index: int) -> FloatArray:
     return np.asarray(evaluation.traces["gt_reward"][index], dtype=np.float32)
 
 
-def paired_panels(left: tuple[str, Evaluation], right: tuple[str, Evaluation]) -> list[EpisodePanel]:
+def paired_panels(left: tuple[str, Evaluation], right: tuple[str, Evaluation], film: Film) -> list[EpisodePanel]:
     """Two policies on the same start side by side: where the right one gains most, gains as it mostly does, and least.
 
     Args:
         left: name and evaluation of one policy.
         right: of the other; without equal starts there is nothing to pair, and the list is empty.
+        film: makes the videos.
     """
     (left_name, one), (right_name, other) = left, right
     if one.config.starts != other.config.starts:
@@ -86,7 +87,7 @@ def paired_panels(left: tuple[str, Evaluation], right: tuple[str, Evaluation]) -
     for which, index in representative(after - before).items():
         before_qpos, after_qpos = one.traces["qpos"][index], other.traces["qpos"][index]
         name = f"pair-{artifacts.hash_arrays(before_qpos, after_qpos)[:8]}.mp4"
-        video = ensure_video(before_qpos, evaluation_folder(other.run, other.config) / name, beside=after_qpos)
+        video = film(Video(before_qpos, evaluation_folder(other.run, other.config) / name, beside=after_qpos))
         title = f"{left_name} (left, {before[index]:.0f} %) beside {right_name} (right): {which} gain"
         panel = _panel(title, right_name, other, index, video)
         panels.append(replace(panel, beside=(left_name, _progress(one, index))))

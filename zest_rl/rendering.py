@@ -7,7 +7,9 @@ the whole robot when it is hidden). The physics model stays untouched; only the 
 
 from __future__ import annotations
 
+import atexit
 import dataclasses
+import functools
 import importlib
 import importlib.metadata
 import importlib.util
@@ -210,6 +212,16 @@ class StateRenderer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+@functools.cache
+def shared_renderer(config: RenderConfig, cameras: tuple[Camera, ...]) -> StateRenderer:
+    """Return this process's renderer, open until the process ends: to build one takes half a second, or with the
+    robot's meshes two.
+    """
+    renderer = StateRenderer(config, cameras)
+    atexit.register(renderer.close)  # left open, or closed after the GL library, it complains when the process ends
+    return renderer
 
 
 def _mujoco_camera(camera: Camera) -> mujoco.MjvCamera:

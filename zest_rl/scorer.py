@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl import artifacts
-from zest_rl.embed import EmbedConfig, StateEmbedder, shared_renderer
+from zest_rl.embed import EmbedConfig, StateEmbedder
 from zest_rl.embedders import Precision
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.frames import Views, canonical_states, scene_pair
@@ -94,7 +94,7 @@ class Scorer:
         """
         task = get_task(config.views.task)
         same_scene = config.goal == SAME_SCENE
-        scene = scene_pair(shared_renderer(config.views), scene_qpos, task) if same_scene else None
+        scene = scene_pair(config.views.shared_renderer(), scene_qpos, task) if same_scene else None
         goal = read_goal(config.goal, task, scene)
         device = options.get("device", "auto")
         embedder = EmbedConfig(config.views, config.embedder, config.precision, device).load_embedder()

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -9,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zest_rl import artifacts
-from zest_rl.rendering import Camera, RenderConfig, StateRenderer
+from zest_rl.parallel import map_jobs
+from zest_rl.rendering import Camera, RenderConfig, shared_renderer
 
 SCENE = Camera(lookat=(-0.4, 0.3, 1.9), distance=2.4, azimuth=60.0, elevation=-25.0)
 """Robot, microwave, stove and cabinets in one picture."""
@@ -17,35 +21,64 @@ FPS = 12.5
 """Frames per second of the environment: a video runs in real time."""
 
 
-def write_video(
-    states: NDArray[np.float64], path: Path, *, beside: NDArray[np.float64] | None = None, size: int = 320
-) -> Path:
-    """Render an episode and write it as H.264.
+@dataclass(frozen=True, eq=False)
+class Video:
+    """An episode to be shown, and where."""
 
-    Args:
-        states: (T+1, nq) simulator positions.
-        path: where the MP4 is left, atomically.
-        beside: (T+1, nq) of another episode, which is shown to the right.
-        size: side of the square frames, in pixels; even.
-    """
-    episodes = [states] if beside is None else [states, beside]
-    with StateRenderer(RenderConfig(size=size, robot=True), (SCENE,)) as renderer:
-        frames: list[ArrayLike] = [
-            np.hstack([renderer.render(qpos)[0] for qpos in step]) for step in zip(*episodes, strict=True)
-        ]
-    with artifacts.atomic_path(path) as temporary:
+    states: NDArray[np.float64]
+    """(T+1, nq) simulator positions."""
+    path: Path
+    beside: NDArray[np.float64] | None = None
+    """(T+1, nq) of another episode, which is shown to the right."""
+
+
+Film = Callable[[Video], Path]
+"""Returns the path of a video that is there, or will be when somebody looks at it."""
+
+
+def write_video(video: Video, size: int = 320) -> Path:
+    """Render an episode and write it as H.264, atomically; `size` is the side of the square frames, in even pixels."""
+    episodes = [video.states] if video.beside is None else [video.states, video.beside]
+    renderer = shared_renderer(RenderConfig(size=size, robot=True), (SCENE,))
+    frames: list[ArrayLike] = [
+        np.hstack([renderer.render(qpos)[0] for qpos in step]) for step in zip(*episodes, strict=True)
+    ]
+    with artifacts.atomic_path(video.path) as temporary:
         mp4 = temporary.with_suffix(".mp4")
         try:
             imageio.mimwrite(mp4, frames, fps=FPS, codec="libx264", quality=7, macro_block_size=2)
             mp4.replace(temporary)
         finally:
             mp4.unlink(missing_ok=True)
-    return path
+    return video.path
 
 
-def ensure_video(states: NDArray[np.float64], path: Path, *, beside: NDArray[np.float64] | None = None) -> Path:
-    """Return `path`, after `write_video` if nothing is there yet."""
-    return path if path.exists() else write_video(states, path, beside=beside)
+def ensure_video(video: Video) -> Path:
+    """Return the video's path, after `write_video` if nothing is there yet."""
+    return video.path if video.path.exists() else write_video(video)
+
+
+def ensure_videos(
+    videos: Iterable[Video], *, n_workers: int | None = None, on_done: Callable[[], None] = lambda: None
+) -> None:
+    """Write the videos that are not there yet, one process per core; those of one path are the same.
+
+    Args:
+        videos: what to write.
+        n_workers: number of processes, default one per core.
+        on_done: called for each of them.
+
+    Raises:
+        ZestError: a process died; finished videos are kept.
+    """
+    jobs = {artifacts.hash_json(str(video.path)): video for video in videos}
+    with tempfile.TemporaryDirectory() as scratch:
+        map_jobs(_ensure, jobs, Path(scratch), n_workers=n_workers, on_done=lambda _: on_done())
+
+
+def _ensure(video: Video) -> dict[str, NDArray[np.generic]]:
+    ensure_video(video)
+    return {}
 
 
 def representative(returns: NDArray[np.float64]) -> dict[str, int]:

@@ -44,7 +44,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     import time
 
     from zest_rl.evaluation import evaluate, evaluation_folder
-    from zest_rl.videos import ensure_video, representative
+    from zest_rl.videos import Video, ensure_videos, representative
 
     started = time.monotonic()
     what = settings(config)
@@ -61,14 +61,14 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     seconds = time.monotonic() - started
     videos = {}
     if config.videos:
-        for name, index in representative(result.normalized()).items():
-            path = folder / f"{name}.mp4"
-            videos[name] = str(ensure_video(result.traces["qpos"][index], path))
+        shown = representative(result.normalized())
+        videos = {name: Video(result.traces["qpos"][index], folder / f"{name}.mp4") for name, index in shown.items()}
+        ensure_videos(videos.values(), n_workers=config.n_workers)
     return {
         "run": str(config.run),
         **result.summary(),
         "result": str(folder / "result.json"),
-        "videos": videos,
+        "videos": {name: str(video.path) for name, video in videos.items()},
         "seconds": round(seconds, 2),
         "next": f"zest report {shlex.quote(str(config.run))}",
     }

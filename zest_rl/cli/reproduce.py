@@ -22,6 +22,7 @@ from zest_rl.cli.ui import SilentUi, Ui
 if TYPE_CHECKING:
     from zest_rl.comparison import Method
     from zest_rl.report import MethodRow, Report
+    from zest_rl.videos import Video
 
 POLL_SECONDS = 2.0
 
@@ -43,6 +44,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     from zest_rl import artifacts
     from zest_rl.comparison import overview
     from zest_rl.report import write_report
+    from zest_rl.videos import ensure_videos
 
     started = time.monotonic()
     plan = read_plan(config.file)
@@ -56,10 +58,13 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     ui.say("[4/4] report")
     details = {"recipe": {"file": config.file.name, **asdict(plan.recipe)}}
     methods = {task: _methods(plan, cells, task) for task in datasets}
+    videos: list[Video] = []
     reports = {
-        task: _task_report(plan, task, methods[task], datasets[task], {**details, "collected": collected[task]})
+        task: _task_report(plan, task, methods[task], datasets[task], {**details, "collected": collected[task]}, videos)
         for task in datasets
     }
+    with ui.progress("videos", len(videos)) as advance:
+        ensure_videos(videos, n_workers=config.n_workers, on_done=advance)
     if len(reports) == 1:
         (report,) = reports.values()
     else:
@@ -140,8 +145,15 @@ def _methods(plan: Plan, cells: list[Cell], task: str) -> list[Method]:
     ]
 
 
-def _task_report(plan: Plan, task: str, methods: list[Method], datasets: TaskData, details: dict[str, Any]) -> Report:
+def _task_report(
+    plan: Plan, task: str, methods: list[Method], datasets: TaskData, details: dict[str, Any], videos: list[Video]
+) -> Report:
+    """Compare the methods on one task; `videos` takes up those that the report shows and somebody has yet to write."""
     from zest_rl.comparison import compare
+
+    def film(video: Video) -> Path:
+        videos.append(video)
+        return video.path
 
     return compare(
         plan.recipe.title if len(plan.collect) == 1 else f"{plan.recipe.title}: {task}",
@@ -151,6 +163,7 @@ def _task_report(plan: Plan, task: str, methods: list[Method], datasets: TaskDat
         paper_demo=plan.recipe.paper_demo,
         caveats=plan.recipe.caveats,
         details=details,
+        film=film,
     )
 
 
