@@ -109,6 +109,15 @@ def test_starts_spread_over_the_arm_joints_only_and_stay_within_the_joints_range
     assert (np.ptp(starts[:, ARM_DIM:], axis=0) == 0).all()
 
 
+def test_objects_start_at_rest(env):
+    _, info = env.reset(seed=0)
+    start = info["state"]["qpos"]
+    assert np.linalg.norm(start[26:30]) == pytest.approx(1, abs=1e-6)  # the kettle's orientation
+    for _ in range(5):
+        _, _, _, _, info = env.step(np.zeros(ACT_DIM, np.float32))
+        np.testing.assert_allclose(info["state"]["qpos"][ACT_DIM:], start[ACT_DIM:], atol=1e-4)
+
+
 def test_without_init_noise_every_seed_starts_alike():
     still = KitchenEnv("micro", init_noise=0.0)
     np.testing.assert_array_equal(still.reset(seed=0)[0], still.reset(seed=1)[0])

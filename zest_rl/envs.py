@@ -6,6 +6,8 @@ package. What differs, and why:
 - no observation noise. There, control starts from the last *noisy* joint positions, so the same state and action
   can lead to different states; here the next state depends on state and action alone;
 - the seed moves the arm's start (there it drives the noise only), and start values beyond a joint's range are clipped;
+- objects start at rest. There the kettle starts tilted and in the air: it falls by a millimetre within the first step,
+  a change that every later frame would show and that is not the robot's doing;
 - the reward is the progress of one joint, so that it is a level like the ZeST scores; nothing ends an episode early.
 
 Importing this module registers ``zest/Kitchen-v0``.
@@ -39,6 +41,8 @@ HORIZON = 100
 ACT_DIM = 9
 """Seven arm joints, then two fingers."""
 ARM_DIM = 7
+SETTLE_STEPS = 1000
+"""Simulator steps (2 s) in which the objects come to rest before anything starts."""
 FRAME_SKIP = 40
 """Simulator steps of 2 ms per environment step: 12.5 Hz."""
 MAX_JOINT_SPEED = 2.0
@@ -157,10 +161,21 @@ def _load_kitchen() -> _Kitchen:
     check_mujoco(mujoco.__version__)
     robot = FrankaKitchen().robot_env
     low, high = robot.robot_pos_bound[:ACT_DIM].T.copy()
-    kitchen = _Kitchen(robot.model, robot.init_qpos.copy(), low, high)
+    kitchen = _Kitchen(robot.model, _at_rest(robot.model, robot.init_qpos), low, high)
     for array in (kitchen.start_qpos, low, high):
         array.setflags(write=False)
     return kitchen
+
+
+def _at_rest(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a copy of `qpos` (nq,) with the objects where they come to rest; the robot stays where it is."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = _clip_to_ranges(model, qpos)
+    data.ctrl[:] = qpos[:ACT_DIM]
+    mujoco.mj_step(model, data, nstep=SETTLE_STEPS)
+    rest = qpos.copy()
+    rest[ACT_DIM:] = data.qpos[ACT_DIM:]
+    return rest
 
 
 def check_mujoco(version: str) -> None:

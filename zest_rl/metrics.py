@@ -86,6 +86,40 @@ def bootstrap(
     return Estimate(float(statistic(values.ravel())), float(low), float(high))
 
 
+def over_episodes(
+    statistic: Callable[[NDArray[np.intp]], float], n: int, *, seed: int = 0, n_resamples: int = 1000
+) -> Estimate:
+    """A statistic of n episodes with its 95 % percentile bootstrap over them.
+
+    Args:
+        statistic: of the episodes with these indices, (n,), some more than once; NaN where it is undefined.
+        n: number of episodes.
+        seed: of the resampling.
+        n_resamples: number of bootstrap samples; those on which the statistic is undefined are left out.
+    """
+    value = statistic(np.arange(n))
+    if np.isnan(value):
+        return Estimate(value, value, value)
+    rng = np.random.default_rng(seed)
+    draws = (rng.integers(n, size=n) for _ in range(n_resamples))
+    low, high = np.nanquantile([statistic(draw) for draw in draws], [0.025, 0.975])
+    return Estimate(value, float(low), float(high))
+
+
+def paired(a: Values, b: Values) -> tuple[Values, Values]:
+    """Return two values per episode as float64 arrays (N,).
+
+    Raises:
+        BadInput: they are not equally long lists of at least 3 values.
+    """
+    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    if a.shape != b.shape or a.ndim != 1 or len(a) < 3:
+        raise BadInput(
+            f"a rank correlation needs two equally long lists of at least 3 values, got {a.shape}, {b.shape}"
+        )
+    return a, b
+
+
 def spearman(a: Values, b: Values, *, seed: int = 0, n_resamples: int = 1000) -> Estimate:
     """Spearman's rank correlation of two (N,) arrays, with a percentile bootstrap over the N pairs.
 
@@ -93,24 +127,14 @@ def spearman(a: Values, b: Values, *, seed: int = 0, n_resamples: int = 1000) ->
     """
     from scipy import stats
 
-    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
-    if a.shape != b.shape or a.ndim != 1 or len(a) < 3:
-        raise BadInput(
-            f"a rank correlation needs two equally long lists of at least 3 values, got {a.shape}, {b.shape}"
-        )
+    a, b = paired(a, b)
 
-    def rho(x: Values, y: Values) -> float:
-        if np.ptp(x) == 0 or np.ptp(y) == 0:
+    def rho(i: NDArray[np.intp]) -> float:
+        if np.ptp(a[i]) == 0 or np.ptp(b[i]) == 0:
             return float("nan")
-        return float(stats.spearmanr(x, y).statistic)
+        return float(stats.spearmanr(a[i], b[i]).statistic)
 
-    value = rho(a, b)
-    if np.isnan(value):
-        return Estimate(value, value, value)
-    rng = np.random.default_rng(seed)
-    draws = (rng.integers(len(a), size=len(a)) for _ in range(n_resamples))
-    low, high = np.nanquantile([rho(a[i], b[i]) for i in draws], [0.025, 0.975])
-    return Estimate(value, float(low), float(high))
+    return over_episodes(rho, len(a), seed=seed, n_resamples=n_resamples)
 
 
 def wilson(n_successes: int, n: int) -> Estimate:
