@@ -16,16 +16,16 @@ PACKAGE = Path(zest_rl.__file__).parent
 ROOT = PACKAGE.parent
 
 ORDER = (
-    "load_order", "errors", "types", "artifacts", "parallel", "tasks", "data", "data_writer", "metrics", "envs",
-    "arm", "experts", "collect",
+    "load_order", "errors", "types", "artifacts", "parallel", "tasks", "data", "data_writer", "metrics", "quality",
+    "envs", "arm", "experts", "collect",
     "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "relabel", "agents",
-    "checkpoints", "training", "evaluation", "report", "panels", "comparison",
-    "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.train", "cli.evaluate",
-    "cli.report", "cli.plans", "cli.reproduce",
+    "checkpoints", "training", "evaluation", "report", "panels", "comparison", "inspection",
+    "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.inspect", "cli.train",
+    "cli.evaluate", "cli.report", "cli.plans", "cli.reproduce",
 )  # fmt: skip
 """The pipeline: a module imports only what stands before it. A folder is listed once, its files share the place."""
 
-MAY_READ_GROUND_TRUTH = ("data", "panels", "comparison")
+MAY_READ_GROUND_TRUTH = ("data", "panels", "comparison", "inspection")
 """`read_ground_truth` and its only callers, which make reports: nothing that chooses or trains anything."""
 
 HEAVY = ("torch", "transformers", "mujoco", "minari", "timm", "open_clip", "gymnasium", "matplotlib", "scipy", "h5py")

@@ -39,7 +39,7 @@ class ScorerConfig:
     similarity: Similarity = "cos"
     precision: Precision = "auto"
     goal_share: float = 1.0
-    """Share of the goals that are used: those that the episodes come nearest to (`Scorer.select_goals`)."""
+    """Share of the goals that are used: those that the episodes end nearest to (`Scorer.select_goals`)."""
 
     def __post_init__(self) -> None:
         if not 0 < self.goal_share <= 1:
@@ -132,8 +132,9 @@ class Scorer:
     ) -> NDArray[np.intp]:
         """Keep the share ``config.goal_share`` of the goals (at least one) and forget the others.
 
-        The rule needs no ground truth ("goal images with high similarity", Cui et al. §5.3): kept are the goals with
-        the highest best score of an episode, averaged over episodes.
+        The rule needs no ground truth ("goal images with high similarity", Cui et al. §5.3): kept are the goals by
+        which the last frames of the episodes score highest on average. It takes the data to lead somewhere: on
+        behaviour without intention it picks what resembles its end.
 
         Args:
             states: (T+1, nq) simulator positions per episode.
@@ -144,12 +145,13 @@ class Scorer:
         """
         n_goals = self.goals.shape[-2]
         n_kept = max(1, round(self.config.goal_share * n_goals))
-        best = np.zeros(n_goals)
-        for frames, _ in self._frames(states, on_progress):
+        at_end = np.zeros(n_goals)
+        for frames, inverse in self._frames(states, on_progress):
+            ends = frames[[0, 1 + inverse[-1]]]
             for k in range(n_goals):
                 goal = self.goals[..., k : k + 1, :]
-                best[k] += score_views(frames, self.starts, goal, self.config.features, self.config.similarity).max()
-        kept = np.sort(np.argsort(-best, kind="stable")[:n_kept])
+                at_end[k] += score_views(ends, self.starts, goal, self.config.features, self.config.similarity)[-1]
+        kept = np.sort(np.argsort(-at_end, kind="stable")[:n_kept])
         self.keep_goals(kept)
         return kept
 
@@ -206,8 +208,9 @@ class Scorer:
         """Hash of all that a score depends on; names of files and folders are left out."""
         described = self.describe()
         config = {k: v for k, v in described["config"].items() if k in ("features", "similarity", "goal_share")}
+        rule = [] if self.config.goal_share == 1 else ["by last frames"]
         hashes = [described[k] for k in ("goal_sha256", "embedder_sha256", "views_sha256")]
-        return artifacts.hash_json([config, hashes])
+        return artifacts.hash_json([config, *rule, hashes])
 
     def save(self, path: Path) -> None:
         """Write the goal's embeddings and the config as one safetensors file."""

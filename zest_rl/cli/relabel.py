@@ -27,7 +27,7 @@ class Config:
     reward: Literal["level", "difference"] = "level"
     """The score after each action, or its change (an ablation)."""
     goal_share: float = 1.0
-    """Share of the goal pictures to use: those that the dataset's frames come nearest to."""
+    """Share of the goal pictures to use: those that the dataset's episodes end nearest to."""
     shuffle: int | None = None
     """Null control: give each episode the scores of another one, drawn with this seed."""
     views: int = 8

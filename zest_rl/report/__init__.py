@@ -3,9 +3,21 @@
 `data` holds what a report says, `charts` draws it as SVG, `page` puts both into `template.html`.
 """
 
-from zest_rl.report.data import Curve, EpisodePanel, GoalPanel, MethodRow, Report, Scatter, Section
+from zest_rl.report.data import (
+    Curve,
+    EpisodePanel,
+    GoalPanel,
+    Matrix,
+    MethodRow,
+    QualityRow,
+    QualityTable,
+    Report,
+    Scatter,
+    Section,
+)
 from zest_rl.report.page import render_html, write_report
 
 __all__ = [
-    "Curve", "EpisodePanel", "GoalPanel", "MethodRow", "Report", "Scatter", "Section", "render_html", "write_report",
+    "Curve", "EpisodePanel", "GoalPanel", "Matrix", "MethodRow", "QualityRow", "QualityTable", "Report", "Scatter",
+    "Section", "render_html", "write_report",
 ]  # fmt: skip

@@ -134,13 +134,13 @@ class Scatter:
 
 @dataclass(frozen=True)
 class Curve:
-    """One line of a learning curve; curves of the same quantity share a chart."""
+    """One line of a learning curve, or of scores over time; curves of the same quantity share a chart."""
 
     method: str
     quantity: str
     """What is drawn upward, with its unit: `validation loss`."""
     steps: FloatArray
-    """(n,) float32, gradient steps."""
+    """(n,) float32, gradient steps (or an episode's steps)."""
     values: FloatArray
     """(n,) float32, the mean over seeds."""
     low: FloatArray | None = None
@@ -166,6 +166,42 @@ class Section:
 
 
 @dataclass(frozen=True)
+class QualityRow:
+    """One figure that judges rewards, for each of several datasets."""
+
+    name: str
+    meaning: str
+    values: tuple[tuple[float, float, float] | None, ...]
+    """Value, lower and upper end of its 95 % interval; None where it was not measured."""
+
+
+@dataclass(frozen=True)
+class QualityTable:
+    """What the rewards of several datasets are worth."""
+
+    datasets: tuple[str, ...]
+    rows: tuple[QualityRow, ...]
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            _check_equal_lengths(row.name, {"values": len(row.values), "datasets": len(self.datasets)})
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """Mean score of where the episodes of each dataset (rows) end, by the goal of each (columns)."""
+
+    names: tuple[str, ...]
+    values: FloatArray
+    """(n, n) float32."""
+
+    def __post_init__(self) -> None:
+        if self.values.shape != (len(self.names), len(self.names)):
+            n = len(self.names)
+            raise BadInput(f"a matrix of {n} datasets must have shape ({n}, {n}), got {self.values.shape}")
+
+
+@dataclass(frozen=True)
 class Report:
     """Everything one HTML file shows. Empty sections are left out."""
 
@@ -173,9 +209,14 @@ class Report:
     summary_sentence: str
     table: tuple[MethodRow, ...] = ()
     sections: tuple[Section, ...] = ()
+    warnings: tuple[str, ...] = ()
+    quality: QualityTable | None = None
+    matrix: Matrix | None = None
     goals: tuple[GoalPanel, ...] = ()
     episodes: tuple[EpisodePanel, ...] = ()
     scatters: tuple[Scatter, ...] = ()
+    scores_over_time: tuple[Curve, ...] = ()
+    """Mean scores; their `steps` are those of an episode."""
     curves: tuple[Curve, ...] = ()
     details: Mapping[str, object] = field(default_factory=dict)
     """Configs, versions, provenance: name → anything that reads as JSON; each is a collapsed block."""

@@ -21,7 +21,7 @@ from zest_rl import artifacts
 from zest_rl.errors import BadInput
 from zest_rl.report import charts
 from zest_rl.report.charts import MISSING, Line, number
-from zest_rl.report.data import Curve, EpisodePanel, GoalPanel, MethodRow, Report, Scatter
+from zest_rl.report.data import Curve, EpisodePanel, GoalPanel, Matrix, MethodRow, QualityTable, Report, Scatter
 from zest_rl.types import Frame
 
 THUMBNAIL = 160
@@ -178,7 +178,7 @@ def _episodes(panels: tuple[EpisodePanel, ...]) -> str:
     return "".join(_episode(panel, score_range) for panel in panels)
 
 
-def _curves(curves: Iterable[Curve]) -> str:
+def _curves(curves: Iterable[Curve], x_name: str) -> str:
     by_quantity: dict[str, list[Curve]] = {}
     for curve in curves:
         by_quantity.setdefault(curve.quantity, []).append(curve)
@@ -193,9 +193,49 @@ def _curves(curves: Iterable[Curve]) -> str:
         chart = charts.line_chart(lines, f"{quantity} of {', '.join(c.method for c in group)}")
         figures.append(
             f'<figure class="card"><figcaption><h3>{escape(quantity)}</h3><ul class="legend">{"".join(legend)}</ul>'
-            f'</figcaption>{chart}<p class="axis-name across">Gradient step →</p></figure>'
+            f'</figcaption>{chart}<p class="axis-name across">{x_name} →</p></figure>'
         )
     return f'<div class="grid-of">{"".join(figures)}</div>'
+
+
+def _quality(table: QualityTable) -> str:
+    head = "".join(f'<th scope="col" class="num">{escape(name)}</th>' for name in table.datasets)
+    body = []
+    for row in table.rows:
+        cells = [
+            f'<td class="num" data-label="{escape(name)}">'
+            + (MISSING if value is None else f"<b>{number(value[0])}</b>{_note(_between(value[1], value[2], 2))}")
+            + "</td>"
+            for name, value in zip(table.datasets, row.values, strict=True)
+        ]
+        body.append(f'<tr><th scope="row">{escape(row.name)}{_note(escape(row.meaning))}</th>{"".join(cells)}</tr>')
+    return f'<table><thead><tr><th scope="col">Figure</th>{head}</tr></thead><tbody>{"".join(body)}</tbody></table>'
+
+
+def _note(text: str) -> str:
+    return f'<span class="note">{text}</span>'
+
+
+def _matrix(matrix: Matrix) -> str:
+    head = "".join(f'<th scope="col" class="num">{escape(name)}</th>' for name in matrix.names)
+    highest = matrix.values.argmax(axis=0)
+    rows = []
+    for i, (name, values) in enumerate(zip(matrix.names, matrix.values, strict=True)):
+        cells = "".join(
+            f'<td class="num" data-label="{escape(goal)}">'
+            + (f"<b>{number(float(value))}</b>" if highest[j] == i else number(float(value)))
+            + "</td>"
+            for j, (goal, value) in enumerate(zip(matrix.names, values, strict=True))
+        )
+        rows.append(f'<tr><th scope="row">{escape(name)}</th>{cells}</tr>')
+    return (
+        f'<table><thead><tr><th scope="col">Episodes of ↓ by the goal of →</th>{head}</tr></thead>'
+        f"<tbody>{''.join(rows)}</tbody></table>"
+    )
+
+
+def _list(items: Iterable[str]) -> str:
+    return f'<ul class="caveats">{"".join(f"<li>{escape(item)}</li>" for item in items)}</ul>'
 
 
 def _plain(value: object) -> object:
@@ -235,8 +275,15 @@ def _sections(report: Report) -> list[tuple[str, str, str]]:
         )
         sections.append(("Tasks", intro, body))
     if report.caveats:
-        items = "".join(f"<li>{escape(caveat)}</li>" for caveat in report.caveats)
-        sections.append(("Caveats", "", f'<ul class="caveats">{items}</ul>'))
+        sections.append(("Caveats", "", _list(report.caveats)))
+    if report.warnings:
+        sections.append(("Warnings", "What speaks against training on these rewards.", _list(report.warnings)))
+    if report.quality:
+        intro = "Small figures are 95 % bootstrap intervals over episodes. Ground truth judges a reward, it makes none."
+        sections.append(("Reward quality", intro, _quality(report.quality)))
+    if report.matrix:
+        intro = "Mean score of where episodes end; a goal should score those of its own task highest (bold: highest)."
+        sections.append(("Tasks against goals", intro, _matrix(report.matrix)))
     if report.goals:
         intro = "What the reward was told: the state at the start and the state wanted. ρ is the Spearman correlation."
         sections.append(("Goals", intro, f'<div class="grid-of">{"".join(map(_goal, report.goals))}</div>'))
@@ -244,12 +291,15 @@ def _sections(report: Report) -> list[tuple[str, str, str]]:
         intro = "One dot is one episode. A reward worth training on ranks episodes as ground truth does."
         body = f'<div class="small grid-of">{"".join(map(_scatter, report.scatters))}</div>'
         sections.append(("Ranking", intro, body))
+    if report.scores_over_time:
+        intro = "Mean score at each step: a reward worth training on parts successes from failures."
+        sections.append(("Scores over time", intro, _curves(report.scores_over_time, "Step")))
     if report.episodes:
         intro = "Drag in a chart, or focus it and press the arrow keys, to move through the video; space plays."
         sections.append(("Episodes", intro, _episodes(report.episodes)))
     if report.curves:
         intro = "Lines are means over seeds; a band, where there is one, is their spread."
-        sections.append(("Learning curves", intro, _curves(report.curves)))
+        sections.append(("Learning curves", intro, _curves(report.curves, "Gradient step")))
     if report.details:
         intro = "Everything needed to make these figures again."
         sections.append(("Details", intro, _details(report.details)))

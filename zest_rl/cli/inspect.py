@@ -1,0 +1,84 @@
+"""``zest inspect``: what the rewards of a dataset are worth, before anything is trained on them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from zest_rl.cli.ui import Ui
+
+
+@dataclass(frozen=True)
+class Config:
+    """Judge the rewards of relabeled datasets: rankings against the ground truth where there is one, and what can be
+    said without it. With several datasets, one per task, also which task each goal scores highest.
+    """
+
+    datasets: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="DATASET [DATASET …]")]
+    """Relabeled Minari datasets."""
+    output: Path = Path("inspection.html")
+    """The HTML page."""
+
+
+def run(config: Config, ui: Ui) -> dict[str, Any]:
+    """Measure, warn, write the page."""
+    from zest_rl import data
+    from zest_rl.errors import BadInput
+    from zest_rl.inspection import confusion, confusion_warnings, inspect, inspection_report
+    from zest_rl.report import write_report
+
+    if not config.datasets:
+        raise BadInput("`zest inspect` needs at least 1 dataset; `zest relabel` makes them")
+    ids = tuple(dict.fromkeys(config.datasets))
+    inspections = []
+    with ui.progress("datasets", len(ids)) as advance:
+        for dataset in ids:
+            inspections.append(inspect(dataset))
+            advance()
+    means = None
+    if len({data.task_name(dataset) for dataset in ids}) > 1:
+        with ui.progress("goals against tasks", len(ids)) as advance:
+            means = confusion(ids, on_done=advance)
+    warnings = {one.dataset_id: list(one.warnings) for one in inspections}
+    for dataset, warning in ({} if means is None else confusion_warnings(ids, means)).items():
+        warnings[dataset].append(warning)
+    for dataset, found in warnings.items():
+        for warning in found:
+            ui.warn(f"{dataset}: {warning}")
+    page = write_report(inspection_report(inspections, means, warnings), config.output)
+    return {
+        "datasets": {
+            one.dataset_id: {
+                "goal": one.goal,
+                "figures": {
+                    name: None if estimate is None else {"value": estimate.value, "ci95": [estimate.low, estimate.high]}
+                    for name, estimate in one.known_figures().items()
+                },
+            }
+            for one in inspections
+        },
+        "warnings": warnings,
+        "goals_against_tasks": None if means is None else means.tolist(),
+        "report": str(page),
+        "next": f"open {page} in a browser",
+    }
+
+
+def summary(result: Mapping[str, Any]) -> str:
+    """The figures as text, one block per dataset."""
+    lines = []
+    for dataset, judged in result["datasets"].items():
+        lines.append(f"{dataset}, goal {judged['goal']}")
+        for name, figure in judged["figures"].items():
+            value = (
+                "undefined"
+                if figure is None
+                else f"{figure['value']:.3f}  [{figure['ci95'][0]:.3f}, {figure['ci95'][1]:.3f}]"
+            )
+            lines.append(f"  {name:<26}{value}")
+    n_warnings = sum(map(len, result["warnings"].values()))
+    return "\n".join([*lines, f"{n_warnings} warnings", f"report: {result['report']}"])

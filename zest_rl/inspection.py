@@ -1,0 +1,310 @@
+"""Relabeled datasets → what their rewards are worth before anything is trained on them. Reads ground truth, if any."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl import data, metrics, quality
+from zest_rl.errors import BadInput
+from zest_rl.frames import Views, canonical_states
+from zest_rl.metrics import Estimate
+from zest_rl.panels import goal_panel, goal_scatter
+from zest_rl.relabel import SCORER_FILE
+from zest_rl.report import Curve, Matrix, QualityRow, QualityTable, Report
+from zest_rl.scorer import Scorer
+from zest_rl.types import FloatArray, GroundTruth
+
+CLOCK, SATURATED, STILL, CONTRADICTORY = 0.95, 0.95, 0.9, 0.01
+"""From these shares on a warning is given."""
+MIN_EPISODES = 3
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One number that judges a reward."""
+
+    name: str
+    meaning: str
+    needs_truth: bool
+    measure: Callable[[_Rewards], Estimate]
+
+
+@dataclass(frozen=True)
+class _Rewards:
+    """What is known of the rewards of one dataset."""
+
+    scores: list[FloatArray]
+    """(T,) per episode, of the frames after each action."""
+    states: list[NDArray[np.float64]]
+    """(T+1, nq) per episode, rounded as the frames were rendered."""
+    truth: list[GroundTruth] | None
+    returns: NDArray[np.float64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "returns", quality.returns_of(self.scores))
+
+    @property
+    def true_returns(self) -> NDArray[np.float64]:
+        """(N,) float64."""
+        return np.array([episode.episode_return for episode in self.known_truth])
+
+    @property
+    def known_truth(self) -> list[GroundTruth]:
+        """The ground truth, which is there."""
+        assert self.truth is not None
+        return self.truth
+
+
+FIGURES = (
+    Figure(
+        "Spearman ρ",
+        "rank correlation of the episodes' returns with the true ones; 1 is best",
+        True,
+        lambda r: metrics.spearman(r.returns, r.true_returns),
+    ),
+    Figure(
+        "Kendall τ-b",
+        "the same by pairs; 1 is best",
+        True,
+        lambda r: quality.kendall(r.returns, r.true_returns),
+    ),
+    Figure(
+        "Pairwise accuracy",
+        "share of pairs of episodes that are ordered rightly; .5 is chance",
+        True,
+        lambda r: quality.pairwise_accuracy(r.returns, r.true_returns),
+    ),
+    Figure(
+        "AUPRC of success",
+        "how well the return tells successes; chance is their share, which is the next line",
+        True,
+        lambda r: quality.average_precision(r.returns, np.array([e.success for e in r.known_truth])),
+    ),
+    Figure(
+        "Share of successes",
+        "in the dataset",
+        True,
+        lambda r: metrics.wilson(sum(e.success for e in r.known_truth), len(r.known_truth)),
+    ),
+    Figure(
+        "EPIC distance",
+        "to the true reward, step by step; 0 is the same up to scale and offset, .71 unrelated",
+        True,
+        lambda r: quality.epic_distance(r.scores, [e.rewards for e in r.known_truth]),
+    ),
+    Figure(
+        "Value-order correlation",
+        "of score and time within an episode; 1 is a score that never falls",
+        False,
+        lambda r: quality.value_order(r.scores),
+    ),
+    Figure(
+        "Told by the step",
+        "share of the scores' variance that the number of the step explains; 1 is a clock",
+        False,
+        lambda r: quality.share_told_by_step(r.scores),
+    ),
+    Figure(
+        "Saturated",
+        "share of frames that score next to the lowest or the highest",
+        False,
+        lambda r: quality.share_saturated(r.scores),
+    ),
+    Figure(
+        "Nothing to see",
+        "share of frames that show what the first one shows",
+        False,
+        lambda r: quality.share_still(r.states),
+    ),
+    Figure(
+        "Contradictory",
+        "share of frames that score otherwise than an equal one of the same episode; 0 is right",
+        False,
+        lambda r: quality.share_contradictory(r.scores, [episode[1:] for episode in r.states]),
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What can be said of one dataset's rewards."""
+
+    dataset_id: str
+    goal: str
+    figures: Mapping[str, Estimate]
+    """By the names of `FIGURES`; those that need ground truth are missing where there is none."""
+    warnings: tuple[str, ...]
+    over_time: Mapping[str, FloatArray]
+    """Mean score at each step (T,), of successes and failures; without ground truth, of all episodes."""
+    has_truth: bool
+
+    def known_figures(self) -> dict[str, Estimate | None]:
+        """Every figure that was measured, by name; None where it is undefined, as for constant scores."""
+        return {name: None if math.isnan(one.value) else one for name, one in self.figures.items()}
+
+
+def inspect(dataset_id: str) -> Inspection:
+    """Judge the rewards of a relabeled dataset.
+
+    Raises:
+        BadInput: no such dataset, it was not relabeled, or it has fewer than 3 episodes.
+    """
+    scorer = data.read_metadata(dataset_id).get("zest", {}).get("relabel", {}).get("scorer")
+    if scorer is None:
+        raise BadInput(f"dataset {dataset_id} holds no ZeST scores; run `zest relabel {dataset_id}` and inspect that")
+    views = Views(**scorer["config"]["views"])
+    scores = [score[1:] for score in data.read_scores(dataset_id)]
+    if len(scores) < MIN_EPISODES:
+        raise BadInput(f"rewards can be judged on at least {MIN_EPISODES} episodes, {dataset_id} has {len(scores)}")
+    rewards = _Rewards(
+        scores, [canonical_states(states, views) for states in data.read_states(dataset_id)], _truth(dataset_id)
+    )
+    figures = {
+        figure.name: figure.measure(rewards)
+        for figure in FIGURES
+        if rewards.truth is not None or not figure.needs_truth
+    }
+    return Inspection(
+        dataset_id,
+        scorer["config"]["goal"],
+        figures,
+        tuple(warnings(scores, figures)),
+        _over_time(rewards),
+        rewards.truth is not None,
+    )
+
+
+def _truth(dataset_id: str) -> list[GroundTruth] | None:
+    try:
+        return data.read_ground_truth(dataset_id)
+    except BadInput:
+        return None
+
+
+def warnings(scores: Sequence[FloatArray], figures: Mapping[str, Estimate]) -> list[str]:
+    """What speaks against training on these rewards: sentences, none when nothing does.
+
+    Args:
+        scores: (T,) per episode.
+        figures: by the names of `FIGURES`.
+    """
+    if np.ptp(np.concatenate(scores)) == 0:
+        return ["All frames score the same: this goal and embedder tell nothing apart. Look at the goal's pictures."]
+    found = []
+    if np.ptp(quality.returns_of(scores)) == 0:
+        found.append("All episodes have the same return: there is nothing to condition a Decision Transformer on.")
+    if figures["Contradictory"].value >= CONTRADICTORY:
+        found.append(
+            f"{figures['Contradictory'].value:.0%} of the frames score otherwise than an equal frame of the same "
+            "episode: these scores are not of these episodes (shuffled?)."
+        )
+    if figures["Told by the step"].value >= CLOCK:
+        found.append("The number of the step alone tells the score: the reward is a clock, whatever the robot does.")
+    if figures["Saturated"].value >= SATURATED:
+        found.append("Nearly all frames score next to the lowest or the highest: most progress is not rewarded.")
+    if figures["Nothing to see"].value >= STILL:
+        found.append("Most frames show what the first one shows: nothing moves, or the cameras do not see it.")
+    rho = figures.get("Spearman ρ")
+    if rho is not None and not rho.low > 0:  # also when it is NaN
+        against = " The higher the return, the worse the episode." if rho.high < 0 else ""
+        found.append(
+            f"The returns do not rank the episodes as the true ones do: ρ = {rho.value:.2f}, "
+            f"95 % interval {rho.low:.2f} to {rho.high:.2f}.{against}"
+        )
+    return found
+
+
+def _over_time(rewards: _Rewards) -> dict[str, FloatArray]:
+    groups = {"all episodes": list(range(len(rewards.scores)))}
+    if rewards.truth is not None:
+        success = [episode.success for episode in rewards.truth]
+        groups = {"successes": [], "failures": []}
+        for i, won in enumerate(success):
+            groups["successes" if won else "failures"].append(i)
+    return {name: _mean_by_step([rewards.scores[i] for i in group]) for name, group in groups.items() if group}
+
+
+def _mean_by_step(scores: Sequence[FloatArray]) -> FloatArray:
+    """Mean over those episodes that are long enough: (T of the longest,)."""
+    total, count = np.zeros(max(map(len, scores))), np.zeros(max(map(len, scores)))
+    for score in scores:
+        total[: len(score)] += score
+        count[: len(score)] += 1
+    return np.asarray(total / count, dtype=np.float32)
+
+
+def confusion(dataset_ids: Sequence[str], on_done: Callable[[], object] = lambda: None) -> FloatArray:
+    """Score where each dataset's episodes end by the goal of each: (n, n) float32, rows are datasets, columns goals.
+
+    A goal that is worth something scores the episodes of its own task highest. Needs no ground truth.
+
+    Args:
+        dataset_ids: relabeled datasets, best one per task.
+        on_done: called after each goal.
+    """
+    ends = [[episode[[0, -1]] for episode in data.read_states(dataset_id)] for dataset_id in dataset_ids]
+    means = np.empty((len(dataset_ids), len(dataset_ids)), dtype=np.float32)
+    for column, goal_of in enumerate(dataset_ids):
+        scorer = Scorer.load(data.dataset_path(goal_of) / SCORER_FILE)
+        for row, episodes in enumerate(ends):
+            means[row, column] = np.mean([score[-1] for score in scorer.score_episodes(episodes)[0]])
+        on_done()
+    return means
+
+
+def confusion_warnings(dataset_ids: Sequence[str], means: FloatArray) -> dict[str, str]:
+    """Find the goals that score the episodes of another task higher than those of their own: dataset → sentence."""
+    tasks = [data.task_name(dataset_id) for dataset_id in dataset_ids]
+    found = {}
+    for column, goal_of in enumerate(dataset_ids):
+        best = int(np.argmax(means[:, column]))
+        if tasks[best] != tasks[column]:
+            found[goal_of] = (
+                f"Its goal scores the episodes of {dataset_ids[best]} higher ({means[best, column]:.2f}) than its own "
+                f"({means[column, column]:.2f})."
+            )
+    return found
+
+
+def inspection_report(
+    inspections: Sequence[Inspection], means: FloatArray | None, warnings: Mapping[str, Sequence[str]]
+) -> Report:
+    """Build the page.
+
+    Args:
+        inspections: one per dataset.
+        means: of `confusion`.
+        warnings: by dataset.
+    """
+    names = tuple(one.dataset_id for one in inspections)
+    judged = [one.known_figures() for one in inspections]
+    rows = [
+        QualityRow(figure.name, figure.meaning, tuple(_interval(known.get(figure.name)) for known in judged))
+        for figure in FIGURES
+    ]
+    scatters = [goal_scatter(one.dataset_id, one.dataset_id) for one in inspections if one.has_truth]
+    curves = [
+        Curve(name, one.dataset_id, np.arange(1, len(mean) + 1, dtype=np.float32), mean)
+        for one in inspections
+        for name, mean in one.over_time.items()
+    ]
+    n_warnings = sum(map(len, warnings.values()))
+    return Report(
+        title="What these rewards are worth",
+        summary_sentence=f"{len(names)} datasets, {n_warnings} warnings. Nothing was trained.",
+        warnings=tuple(f"{dataset}: {sentence}" for dataset, found in warnings.items() for sentence in found),
+        quality=QualityTable(names, tuple(rows)),
+        matrix=None if means is None else Matrix(names, means),
+        goals=tuple(goal_panel(scatter.name, scatter.name, scatter) for scatter in scatters),
+        scatters=tuple(scatters),
+        scores_over_time=tuple(curves),
+    )
+
+
+def _interval(estimate: Estimate | None) -> tuple[float, float, float] | None:
+    return None if estimate is None else (estimate.value, estimate.low, estimate.high)
