@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from zest_rl import data, metrics, quality
 from zest_rl.errors import BadInput
 from zest_rl.frames import Views, canonical_states
+from zest_rl.goals import VISUAL_TASKS
 from zest_rl.metrics import Estimate
 from zest_rl.panels import goal_panel, goal_scatter
 from zest_rl.relabel import SCORER_FILE
@@ -135,7 +137,8 @@ class Inspection:
     """What can be said of one dataset's rewards."""
 
     dataset_id: str
-    goal: str
+    label: str
+    """Task and goal, for people: ``sdoor by real_imgs``."""
     figures: Mapping[str, Estimate]
     """By the names of `FIGURES`; those that need ground truth are missing where there is none."""
     warnings: tuple[str, ...]
@@ -154,10 +157,12 @@ def inspect(dataset_id: str) -> Inspection:
     Raises:
         BadInput: no such dataset, it was not relabeled, or it has fewer than 3 episodes.
     """
-    scorer = data.read_metadata(dataset_id).get("zest", {}).get("relabel", {}).get("scorer")
-    if scorer is None:
+    made = data.read_metadata(dataset_id).get("zest", {}).get("relabel")
+    if made is None:
         raise BadInput(f"dataset {dataset_id} holds no ZeST scores; run `zest relabel {dataset_id}` and inspect that")
-    views = Views(**scorer["config"]["views"])
+    scorer = made["scorer"]["config"]
+    views = Views(**scorer["views"])
+    label = f"{views.task} by {Path(scorer['goal']).name.removeprefix(VISUAL_TASKS)}"
     scores = [score[1:] for score in data.read_scores(dataset_id)]
     if len(scores) < MIN_EPISODES:
         raise BadInput(f"rewards can be judged on at least {MIN_EPISODES} episodes, {dataset_id} has {len(scores)}")
@@ -171,7 +176,7 @@ def inspect(dataset_id: str) -> Inspection:
     }
     return Inspection(
         dataset_id,
-        scorer["config"]["goal"],
+        label if made["shuffle"] is None else f"{label}, shuffled",
         figures,
         tuple(warnings(scores, figures)),
         _over_time(rewards),
@@ -281,17 +286,21 @@ def inspection_report(
         means: of `confusion`.
         warnings: by dataset.
     """
-    names = tuple(one.dataset_id for one in inspections)
+    names = tuple(_unique([(one.label, one.dataset_id) for one in inspections]))
     judged = [one.known_figures() for one in inspections]
     rows = [
         QualityRow(figure.name, figure.meaning, tuple(_interval(known.get(figure.name)) for known in judged))
         for figure in FIGURES
     ]
-    scatters = [goal_scatter(one.dataset_id, one.dataset_id) for one in inspections if one.has_truth]
+    scatters = {
+        one.dataset_id: goal_scatter(name, one.dataset_id)
+        for name, one in zip(names, inspections, strict=True)
+        if one.has_truth
+    }
     curves = [
-        Curve(name, one.dataset_id, np.arange(1, len(mean) + 1, dtype=np.float32), mean)
-        for one in inspections
-        for name, mean in one.over_time.items()
+        Curve(group, f"{name}: mean score", np.arange(1, len(mean) + 1, dtype=np.float32), mean)
+        for name, one in zip(names, inspections, strict=True)
+        for group, mean in one.over_time.items()
     ]
     n_warnings = sum(map(len, warnings.values()))
     return Report(
@@ -300,10 +309,17 @@ def inspection_report(
         warnings=tuple(f"{dataset}: {sentence}" for dataset, found in warnings.items() for sentence in found),
         quality=QualityTable(names, tuple(rows)),
         matrix=None if means is None else Matrix(names, means),
-        goals=tuple(goal_panel(scatter.name, scatter.name, scatter) for scatter in scatters),
-        scatters=tuple(scatters),
+        goals=tuple(goal_panel(scatter.name, dataset_id, scatter) for dataset_id, scatter in scatters.items()),
+        scatters=tuple(scatters.values()),
+        details={name: {"dataset": one.dataset_id} for name, one in zip(names, inspections, strict=True)},
         scores_over_time=tuple(curves),
     )
+
+
+def _unique(labelled: Sequence[tuple[str, str]]) -> list[str]:
+    """Return the labels of (label, dataset), with the dataset where a label is there twice."""
+    labels = [label for label, _ in labelled]
+    return [f"{label} ({dataset_id})" if labels.count(label) > 1 else label for label, dataset_id in labelled]
 
 
 def _interval(estimate: Estimate | None) -> tuple[float, float, float] | None:

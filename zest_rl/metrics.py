@@ -102,7 +102,9 @@ def over_episodes(
         return Estimate(value, value, value)
     rng = np.random.default_rng(seed)
     draws = (rng.integers(n, size=n) for _ in range(n_resamples))
-    low, high = np.nanquantile([statistic(draw) for draw in draws], [0.025, 0.975])
+    drawn = np.array([statistic(draw) for draw in draws])
+    drawn = drawn[~np.isnan(drawn)]
+    low, high = np.quantile(drawn, [0.025, 0.975]) if len(drawn) else (np.nan, np.nan)
     return Estimate(value, float(low), float(high))
 
 

@@ -53,7 +53,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     return {
         "datasets": {
             one.dataset_id: {
-                "goal": one.goal,
+                "label": one.label,
                 "figures": {
                     name: None if estimate is None else {"value": estimate.value, "ci95": [estimate.low, estimate.high]}
                     for name, estimate in one.known_figures().items()
@@ -72,7 +72,7 @@ def summary(result: Mapping[str, Any]) -> str:
     """The figures as text, one block per dataset."""
     lines = []
     for dataset, judged in result["datasets"].items():
-        lines.append(f"{dataset}, goal {judged['goal']}")
+        lines.append(f"{dataset}: {judged['label']}")
         for name, figure in judged["figures"].items():
             value = (
                 "undefined"

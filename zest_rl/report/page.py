@@ -209,7 +209,7 @@ def _quality(table: QualityTable) -> str:
             for name, value in zip(table.datasets, row.values, strict=True)
         ]
         body.append(f'<tr><th scope="row">{escape(row.name)}{_note(escape(row.meaning))}</th>{"".join(cells)}</tr>')
-    return f'<table><thead><tr><th scope="col">Figure</th>{head}</tr></thead><tbody>{"".join(body)}</tbody></table>'
+    return _wide_table("Figure", head, body)
 
 
 def _note(text: str) -> str:
@@ -228,9 +228,13 @@ def _matrix(matrix: Matrix) -> str:
             for j, (goal, value) in enumerate(zip(matrix.names, values, strict=True))
         )
         rows.append(f'<tr><th scope="row">{escape(name)}</th>{cells}</tr>')
+    return _wide_table("Episodes of ↓ by the goal of →", head, rows)
+
+
+def _wide_table(corner: str, head: str, rows: Iterable[str]) -> str:
     return (
-        f'<table><thead><tr><th scope="col">Episodes of ↓ by the goal of →</th>{head}</tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table>"
+        f'<div class="wide"><table><thead><tr><th scope="col">{corner}</th>{head}</tr></thead>'
+        f"<tbody>{''.join(rows)}</tbody></table></div>"
     )
 
 

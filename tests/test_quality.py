@@ -1,0 +1,169 @@
+"""Figures that judge a reward: equal to naive loops, right on rewards that are plainly good or bad."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from zest_rl import quality
+from zest_rl.errors import BadInput
+
+N, T = 12, 20
+RISING = np.arange(T, dtype=np.float32)
+small = st.lists(st.integers(0, 4), min_size=3, max_size=9)
+
+
+def noise(seed: int, n: int = N, length: int = T) -> list[np.ndarray]:
+    return list(np.random.default_rng(seed).normal(size=(n, length)).astype(np.float32))
+
+
+def equal(got: float, expected: float) -> bool:
+    return math.isclose(got, expected, abs_tol=1e-9) or (math.isnan(got) and math.isnan(expected))
+
+
+@pytest.fixture(scope="module")
+def quick() -> Iterator[None]:
+    """Two bootstrap samples: the values do not depend on them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(quality, "over_episodes", partial(quality.over_episodes, n_resamples=2))
+        yield
+
+
+# --- against naive loops ---
+
+
+@pytest.mark.usefixtures("quick")
+@given(small, st.data())
+def test_pairwise_accuracy_equals_a_loop_over_pairs(returns: list[int], draw: st.DataObject) -> None:
+    truth = draw.draw(st.lists(st.integers(0, 3), min_size=len(returns), max_size=len(returns)))
+    points = []
+    for i, j in itertools.combinations(range(len(returns)), 2):
+        if truth[i] != truth[j]:
+            points.append(
+                0.5 if returns[i] == returns[j] else float((returns[i] > returns[j]) == (truth[i] > truth[j]))
+            )
+    expected = np.mean(points) if points else math.nan
+    got = quality.pairwise_accuracy(np.array(returns, float), np.array(truth, float))
+    assert equal(got.value, expected)
+
+
+@pytest.mark.usefixtures("quick")
+@given(small, st.data())
+def test_average_precision_equals_a_loop_over_thresholds(returns: list[int], draw: st.DataObject) -> None:
+    success = draw.draw(st.lists(st.booleans(), min_size=len(returns), max_size=len(returns)))
+    area, recall = 0.0, 0.0
+    for threshold in sorted(set(returns), reverse=True):
+        picked = [won for value, won in zip(returns, success, strict=True) if value >= threshold]
+        now = sum(picked) / sum(success) if any(success) else math.nan
+        area, recall = area + (now - recall) * sum(picked) / len(picked), now
+    got = quality.average_precision(np.array(returns, float), np.array(success))
+    assert equal(got.value, area if any(success) else math.nan)
+
+
+@pytest.mark.usefixtures("quick")
+@given(st.integers(0, 100))
+def test_epic_distance_is_that_of_pearson_s_correlation_over_all_transitions(seed: int) -> None:
+    a, b = noise(seed), noise(seed + 1)
+    rho = stats.pearsonr(np.concatenate(a), np.concatenate(b)).statistic
+    assert quality.epic_distance(a, b).value == pytest.approx(math.sqrt((1 - rho) / 2), abs=1e-6)
+
+
+@pytest.mark.usefixtures("quick")
+@given(st.integers(0, 100))
+def test_the_share_told_by_the_step_is_the_variance_between_steps_over_all(seed: int) -> None:
+    scores = [score[: 5 + i] for i, score in enumerate(noise(seed))]  # of different lengths
+    every = np.concatenate(scores)
+    mean = [np.mean([score[t] for score in scores if len(score) > t]) for t in range(max(map(len, scores)))]
+    told = np.concatenate([mean[: len(score)] for score in scores])
+    assert quality.share_told_by_step(scores).value == pytest.approx(told.var() / every.var(), abs=1e-5)
+
+
+@pytest.mark.usefixtures("quick")
+@given(st.integers(0, 100))
+def test_kendall_and_value_order_are_scipy_s(seed: int) -> None:
+    a, b = np.random.default_rng(seed).normal(size=(2, N))
+    assert quality.kendall(a, b).value == pytest.approx(stats.kendalltau(a, b).statistic)
+    scores = noise(seed)
+    expected = np.mean([stats.spearmanr(score, np.arange(T)).statistic for score in scores])
+    assert quality.value_order(scores).value == pytest.approx(expected)
+
+
+def test_contradictions_equal_a_loop_over_equal_states() -> None:
+    states = [np.array([[0.0], [1.0], [0.0], [1.0], [2.0]]), np.array([[0.0], [0.0]])]
+    scores = [np.array([0.1, 0.5, 0.1, 0.6, 0.9], np.float32), np.array([0.2, 0.3], np.float32)]
+    assert quality.share_contradictory(scores, states).value == pytest.approx(2 / 7)  # .6 for .5, .3 for .2
+
+
+# --- good and bad rewards ---
+
+
+def test_a_perfect_reward_reaches_the_best_values() -> None:
+    truth = noise(0)
+    scores = [3 * episode + 1 for episode in truth]
+    returns, true_returns = quality.returns_of(scores), quality.returns_of(truth)
+    assert quality.kendall(returns, true_returns).value == pytest.approx(1)
+    assert quality.pairwise_accuracy(returns, true_returns).value == 1
+    assert quality.average_precision(returns, true_returns > np.median(true_returns)).value == 1
+    assert quality.epic_distance(scores, truth).value == pytest.approx(0, abs=1e-3)
+    assert quality.epic_distance([-score for score in scores], truth).value == pytest.approx(1, abs=1e-3)
+
+
+def test_a_clock_is_told_by_the_step_and_noise_is_not() -> None:
+    assert quality.share_told_by_step([RISING] * N).value == 1
+    assert quality.share_told_by_step(noise(0, n=200)).value < 0.05
+    assert quality.value_order([RISING] * N).value == 1
+    assert quality.value_order([-RISING] * N).value == -1
+    assert quality.value_order([np.zeros(T, np.float32)] * N).value == 0
+
+
+def test_saturation_counts_the_fuller_end() -> None:
+    score = np.array([0, 1, 1, 1, 0.5, 1, 1, 1, 1, 0.97], np.float32)
+    assert quality.share_saturated([score] * 3).value == pytest.approx(0.8)
+
+
+def test_frames_equal_to_the_first_show_nothing() -> None:
+    states = np.array([[0.0], [0.0], [0.0], [1.0], [0.0]])
+    assert quality.share_still([states] * 3).value == pytest.approx(3 / 4)
+
+
+def test_an_undefined_figure_is_nan_and_not_a_number_that_looks_good() -> None:
+    constant = [np.ones(T, np.float32)] * N
+    truth = noise(0)
+    for estimate in (
+        quality.share_told_by_step(constant),
+        quality.share_saturated(constant),
+        quality.epic_distance(constant, truth),
+        quality.kendall(quality.returns_of(constant), quality.returns_of(truth)),
+        quality.pairwise_accuracy(quality.returns_of(truth), np.ones(N)),
+        quality.average_precision(quality.returns_of(truth), np.zeros(N, bool)),
+    ):
+        assert math.isnan(estimate.value)
+        assert math.isnan(estimate.low)
+
+
+def test_intervals_hold_the_value_and_narrow_with_more_episodes() -> None:
+    few, many = (quality.value_order([RISING + 8 * e for e in noise(0, n=n)]) for n in (10, 200))
+    assert few.low <= few.value <= few.high
+    assert many.high - many.low < few.high - few.low
+
+
+# --- bad input ---
+
+
+def test_lists_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(BadInput, match="at least 1 episode, got 0"):
+        quality.value_order([])
+    with pytest.raises(BadInput, match=r"episode 0 must have \(T >= 1,\) scores and as many ground-truth rewards"):
+        quality.epic_distance([RISING], [RISING[:-1]])
+    with pytest.raises(BadInput, match="equally long lists of at least 3 values"):
+        quality.kendall(np.ones(2), np.ones(2))
+    with pytest.raises(BadInput, match="equally long lists of at least 1 value"):
+        quality.average_precision(np.ones(3), np.ones(2, bool))
