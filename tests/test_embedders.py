@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import open_clip
@@ -338,3 +339,72 @@ def test_a_wrong_option_is_refused() -> None:
         load_embedder("efficientnet-lite0", precision="fp16")  # type: ignore[arg-type]
     with pytest.raises(BadInput, match="batch_size must be at least 1, got 0"):
         load_embedder("efficientnet-lite0", batch_size=0)
+
+
+# ---- registered from outside ----
+
+PLUGIN = """
+import torch
+from torchvision.transforms.functional import pil_to_tensor
+from zest_rl.embedders.networks import Network
+
+def build(rest):  # what stands after "colour:" in the URI
+    torch.manual_seed(int(rest))
+    module = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(4), torch.nn.Flatten(), torch.nn.Linear(48, 16))
+    return Network(module, lambda image: pil_to_tensor(image.resize((32, 32))) / 255, module)
+"""
+
+
+@pytest.fixture
+def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package beside this one that registers the family ``colour:``; also for processes that are started."""
+    site = tmp_path / "site"
+    (site / "colourful-1.0.dist-info").mkdir(parents=True)
+    (site / "colourful.py").write_text(PLUGIN)
+    (site / "colourful-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: colourful\nVersion: 1.0\n")
+    entry = (
+        "[zest_rl.embedders]\ncolour = colourful:build\nbroken = colourful:nothing\nwrong = colourful:pil_to_tensor\n"
+    )
+    (site / "colourful-1.0.dist-info" / "entry_points.txt").write_text(entry)
+    monkeypatch.syspath_prepend(str(site))
+    monkeypatch.setenv("PYTHONPATH", str(site))
+    return site
+
+
+@pytest.mark.usefixtures("plugin")
+def test_an_embedder_registered_by_another_package_embeds(frames: list[np.ndarray]) -> None:
+    assert len(PLUGIN.strip().splitlines()) <= 15
+    embedder = load_embedder("colour:3", precision="fp32")
+    assert (embedder.dim, embedder.reads_text, embedder.embed_images(frames).shape) == (16, False, (5, 16))
+    assert load_embedder("colour:4", precision="fp32").fingerprint != embedder.fingerprint
+    with pytest.raises(BadInput, match=r"unknown embedder 'color:3'.*colour"):
+        load_embedder("color:3")
+
+
+@pytest.mark.usefixtures("plugin")
+@pytest.mark.parametrize(
+    ("uri", "message"),
+    [
+        ("broken:1", "colourful:nothing, which is registered for broken:, failed on 'broken:1'"),
+        ("colour:x", "colourful:build, which is registered for colour:, failed on 'colour:x' .ValueError"),
+        ("wrong:1", "failed on 'wrong:1'"),
+    ],
+)
+def test_a_registered_embedder_that_fails_is_named(uri: str, message: str) -> None:
+    with pytest.raises(ZestError, match=message):
+        load_embedder(uri)
+
+
+@pytest.mark.usefixtures("plugin")
+def test_a_registered_embedder_works_in_every_verb(
+    collected: str, tmp_path: Path, zest: Callable[..., dict[str, Any]]
+) -> None:
+    relabeled = zest(
+        "relabel", collected, "--embedder", "colour:3", "--views", 2, "--tolerance", 0.05, "--n-workers", 2
+    )["dataset"]
+    assert zest("inspect", relabeled, "--output", tmp_path / "page.html")["datasets"][relabeled]["figures"]
+    small = ("--n-updates", 5, "--hidden-size", 32, "--n-layers", 1, "--context-len", 2)
+    run = zest("train", "dt", relabeled, "--run-dir", tmp_path / "run", *small)["run"]
+    evaluated = zest("evaluate", run, "--n-episodes", 2, "--n-workers", 2, "--no-videos")
+    assert evaluated["n_episodes"] == 2
+    assert zest("report", run, "--output", tmp_path / "report.html")["rows"]

@@ -19,7 +19,8 @@ class Config:
     goal: str = "same-scene"
     """Folder with init/ and goal/ pictures, "drawings", "same-scene", or "text:closed microwave -> open microwave"."""
     embedder: str = "efficientnet-lite0"
-    """Frozen network: efficientnet-lite0, open_clip:MODEL/PRETRAINED, torchvision:resnet50, timm:NAME, …@/path."""
+    """Frozen network: efficientnet-lite0, open_clip:MODEL/PRETRAINED, torchvision:resnet50, timm:NAME, …@/path,
+    transformers:/folder, or a family that another package registers."""
     features: Literal["delta", "raw"] = "delta"
     """Compare changes against the start, or the frames themselves."""
     similarity: Literal["cos", "l2"] = "cos"

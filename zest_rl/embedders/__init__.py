@@ -7,7 +7,9 @@
 | `torchvision:resnet50`, `torchvision:resnet50/WEIGHTS` | torchvision's hub; likewise resnet18, 34, 101, 152 |
 | `timm:NAME` | timm's hub |
 | `open_clip:MODEL@/path`, `open_clip:MODEL/TAG@/path`, and so on for the three above | a local checkpoint file |
-| `moco:/path` | a pre-training checkpoint of MoCo v2 (ResNet50) |
+| `moco:/path` | a pre-training checkpoint of MoCo v1 or v2 (ResNet50) |
+| `transformers:/folder`, `transformers:NAME` | Hugging Face's CLIP, SigLIP, DINO: as `save_pretrained` leaves it |
+| `NAME:REST` | a family that another package registers (entry point in the group `zest_rl.embedders`) |
 
 With `@/path` the name still chooses architecture, activation and preprocessing, so keep the TAG when the file holds a
 tag's weights. A checkpoint is a `.safetensors` file or one that `torch.load(weights_only=True)` reads, and it must fill

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import importlib.metadata
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -26,6 +27,9 @@ from zest_rl.types import Frame
 
 Preprocess = Callable[[Image.Image], torch.Tensor]
 
+ENTRY_POINTS = "zest_rl.embedders"
+"""Group of the entry points by which another package registers a family: name → function from the URI's rest to a
+`Network`."""
 _RESNETS = ("resnet18", "resnet34", "resnet50", "resnet101", "resnet152")
 
 
@@ -68,19 +72,43 @@ def build(uri: str) -> Network:
 
     Raises:
         BadInput: unknown family, model or tag; a checkpoint that cannot be read or does not fit.
-        ZestError: the weights cannot be had.
+        ZestError: the weights cannot be had, or a registered embedder fails.
     """
     family, _, rest = uri.partition(":")
     if family == "moco":
         return _build_moco(Path(rest).expanduser())
+    if family == "transformers":
+        from zest_rl.embedders import hugging_face  # it needs what is defined here
+
+        return hugging_face.build(uri, rest)
     builders = {"open_clip": _build_open_clip, "torchvision": _build_torchvision, "timm": _build_timm}
+    registered = {entry.name: entry for entry in importlib.metadata.entry_points(group=ENTRY_POINTS)}
+    if family not in builders and family in registered:
+        return _build_registered(uri, rest, registered[family])
     if family not in builders:
-        raise BadInput(
-            f"unknown embedder {uri!r}; {nearest(family, (checkpoints.DEFAULT_EMBEDDER, 'moco', *builders))}"
-        )
+        known = (checkpoints.DEFAULT_EMBEDDER, "moco", "transformers", *builders, *registered)
+        raise BadInput(f"unknown embedder {uri!r}; {nearest(family, known)}")
     name, at, file = rest.partition("@")
     model, _, tag = name.partition("/")
     return builders[family](uri, model, tag, Path(file).expanduser() if at else None)
+
+
+def _build_registered(uri: str, rest: str, entry: importlib.metadata.EntryPoint) -> Network:
+    """Return what a function of somebody else's package makes of the rest of the URI."""
+    try:
+        network = entry.load()(rest)
+    except ZestError:
+        raise
+    except Exception as error:
+        raise ZestError(
+            f"{entry.value}, which is registered for {entry.name}:, failed on {uri!r} ({type(error).__name__}: {error})"
+        ) from error
+    if not isinstance(network, Network):
+        raise ZestError(
+            f"{entry.value}, which is registered for {entry.name}:, must return a zest_rl.embedders.networks.Network, "
+            f"got {type(network).__name__}"
+        )
+    return network
 
 
 def build_lite0(weights: Path) -> Network:

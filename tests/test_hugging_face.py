@@ -1,0 +1,102 @@
+"""Models of transformers, small and in the real layout, embed as the library itself does."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import transformers
+from PIL import Image
+from safetensors.torch import load_file, save_file
+
+from zest_rl.embedders import load_embedder
+from zest_rl.errors import BadInput
+
+SENTENCES = ["closed microwave", "open microwave", "stove"]
+
+
+@pytest.fixture
+def frames() -> list[np.ndarray]:
+    """Noise of three sizes."""
+    rng = np.random.default_rng(0)
+    return [rng.integers(0, 256, size=(*size, 3), dtype=np.uint8) for size in ((32, 32), (48, 40), (64, 100))]
+
+
+def save_clip_tokenizer(folder: Path) -> None:
+    """A tokenizer in CLIP's layout that knows single letters."""
+    letters = [*"abcdefghijklmnopqrstuvwxyz", *(f"{c}</w>" for c in "abcdefghijklmnopqrstuvwxyz")]
+    vocabulary = {token: i for i, token in enumerate([*letters, "<|startoftext|>", "<|endoftext|>"])}
+    (folder / "vocab.json").write_text(json.dumps(vocabulary))
+    (folder / "merges.txt").write_text("#version: 0.2\n")
+    transformers.CLIPTokenizer(str(folder / "vocab.json"), str(folder / "merges.txt")).save_pretrained(folder)
+
+
+SMALL = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2}
+TEXT = {**SMALL, "vocab_size": 54, "max_position_embeddings": 16}
+VISION = {**SMALL, "image_size": 32, "patch_size": 8}
+PROCESSOR = {"size": {"height": 32, "width": 32}, "crop_size": {"height": 32, "width": 32}}
+
+
+def save_hugging_face(kind: str, folder: Path) -> torch.nn.Module:
+    """A small model with random weights, its processor and its tokenizer, as `save_pretrained` leaves them."""
+    torch.manual_seed(0)
+    if kind == "dinov2":
+        model = transformers.Dinov2Model(transformers.Dinov2Config(**{**VISION, "mlp_ratio": 2}))
+        transformers.BitImageProcessor(**PROCESSOR).save_pretrained(folder)
+    elif kind == "clip":
+        ends = {"bos_token_id": 52, "eos_token_id": 53, "pad_token_id": 53}
+        config = transformers.CLIPConfig(text_config=TEXT | ends, vision_config=VISION, projection_dim=24)
+        model = transformers.CLIPModel(config)
+        transformers.CLIPImageProcessor(**PROCESSOR).save_pretrained(folder)
+        save_clip_tokenizer(folder)
+    else:
+        ends = {"bos_token_id": 52, "eos_token_id": 53, "pad_token_id": 53, "projection_size": 32}
+        model = transformers.SiglipModel(transformers.SiglipConfig(text_config=TEXT | ends, vision_config=VISION))
+        transformers.SiglipImageProcessor(size=PROCESSOR["size"]).save_pretrained(folder)
+        save_clip_tokenizer(folder)
+    model.eval().save_pretrained(folder)
+    return model
+
+
+@pytest.mark.parametrize(("kind", "dim"), [("clip", 24), ("siglip", 32), ("dinov2", 32)])
+def test_transformers_embeds_images_as_the_library_does(
+    kind: str, dim: int, tmp_path: Path, frames: list[np.ndarray]
+) -> None:
+    model = save_hugging_face(kind, tmp_path)
+    embedder = load_embedder(f"transformers:{tmp_path}", precision="fp32")
+    assert (embedder.dim, embedder.reads_text) == (dim, kind != "dinov2")
+    processor = transformers.AutoImageProcessor.from_pretrained(tmp_path)
+    pixels = processor(images=[Image.fromarray(frame) for frame in frames], return_tensors="pt")
+    with torch.inference_mode():
+        output = model(**pixels) if kind == "dinov2" else model.get_image_features(**pixels)
+    np.testing.assert_allclose(embedder.embed_images(frames), output.pooler_output.numpy(), atol=1e-4)
+    assert load_embedder(f"transformers:{tmp_path}", precision="fp32").fingerprint == embedder.fingerprint
+
+
+@pytest.mark.parametrize(("kind", "padding"), [("clip", True), ("siglip", "max_length")])
+def test_transformers_embeds_sentences_as_the_library_does(kind: str, padding: bool | str, tmp_path: Path) -> None:
+    model = save_hugging_face(kind, tmp_path)
+    embedder = load_embedder(f"transformers:{tmp_path}", precision="fp32")
+    tokenizer = transformers.AutoTokenizer.from_pretrained(tmp_path)
+    tokens = tokenizer(SENTENCES, padding=padding, max_length=16, truncation=True, return_tensors="pt")
+    with torch.inference_mode():
+        expected = model.get_text_features(**tokens).pooler_output.numpy()
+    vectors = embedder.embed_texts(SENTENCES)
+    np.testing.assert_allclose(vectors, expected, atol=1e-4)
+    assert not np.allclose(vectors[0], vectors[1])
+
+
+def test_transformers_weights_that_are_not_all_there_are_refused(tmp_path: Path) -> None:
+    """Transformers itself fills them with random numbers and only logs it."""
+    save_hugging_face("clip", tmp_path)
+    state = load_file(tmp_path / "model.safetensors")
+    del state["visual_projection.weight"]
+    save_file(state, tmp_path / "model.safetensors", metadata={"format": "pt"})
+    with pytest.raises(BadInput, match=r"1 missing \(visual_projection.weight\)"):
+        load_embedder(f"transformers:{tmp_path}")
+    (tmp_path / "config.json").unlink()
+    with pytest.raises(BadInput, match=r"config\.json is not a file"):
+        load_embedder(f"transformers:{tmp_path}")

@@ -1,0 +1,100 @@
+"""Networks of Hugging Face's transformers, from a folder that ``save_pretrained`` wrote or from the hub."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from PIL import Image
+
+from zest_rl.embedders import checkpoints
+from zest_rl.embedders.networks import Network
+from zest_rl.errors import BadInput
+
+
+@dataclass(frozen=True, repr=False)
+class _Preprocess:
+    """A model's own image processor as a function of one picture."""
+
+    processor: Any
+
+    def __call__(self, image: Image.Image) -> torch.Tensor:
+        pixels: torch.Tensor = self.processor(images=image, return_tensors="pt")["pixel_values"][0]
+        return pixels
+
+    def __repr__(self) -> str:
+        return str(self.processor.to_json_string())
+
+
+def build(uri: str, source: str) -> Network:
+    """Return the image tower, and the text tower where there is one, of a model of any family that has them.
+
+    Vectors are `get_image_features` and `get_text_features` where the model has them (CLIP, SigLIP), else its pooled
+    output, or its class token without one (DINOv2 and 3, ViT).
+
+    Args:
+        uri: for messages.
+        source: a folder with config, weights and processor; or a name on the hub.
+
+    Raises:
+        BadInput: the folder cannot be read, its weights are not all there, or the model reads no pictures.
+        ZestError: the hub does not answer.
+    """
+    from transformers import AutoImageProcessor, AutoModel, AutoTokenizer
+
+    folder = Path(source).expanduser()
+
+    def load() -> tuple[Any, dict[str, Any], Any]:
+        name = str(folder) if folder.is_dir() else source
+        model, info = AutoModel.from_pretrained(
+            name, output_loading_info=True, dtype=torch.float32, trust_remote_code=False
+        )
+        return model, info, AutoImageProcessor.from_pretrained(name)  # type: ignore[no-untyped-call]
+
+    if folder.is_dir():
+        with checkpoints.reading(folder / "config.json"):
+            module, info, processor = load()
+    else:
+        module, info, processor = checkpoints.fetch(uri, load)
+    checkpoints.refuse_misfits(
+        folder, type(module).__name__, sorted(info["missing_keys"]), (), sorted(map(str, info["mismatched_keys"]))
+    )
+    if processor.model_input_names != ["pixel_values"]:
+        raise BadInput(
+            f"{uri} wants {', '.join(processor.model_input_names)} of a picture, only models that want pixel_values "
+            "alone are supported; use the fixed-resolution model of its family"
+        )
+
+    def encode_images(pixels: torch.Tensor) -> torch.Tensor:
+        if hasattr(module, "get_image_features"):
+            return _vector(module.get_image_features(pixel_values=pixels))
+        return _vector(module(pixel_values=pixels))
+
+    if not hasattr(module, "get_text_features"):
+        return Network(module, _Preprocess(processor), encode_images)
+    tokenizer = None
+
+    def encode_texts(sentences: list[str]) -> torch.Tensor:
+        nonlocal tokenizer
+        if tokenizer is None:
+            name = str(folder) if folder.is_dir() else source
+            tokenizer = checkpoints.fetch(uri, lambda: AutoTokenizer.from_pretrained(name))
+        siglip = module.config.model_type.startswith("siglip")  # which was trained on padded sentences
+        length = module.config.text_config.max_position_embeddings
+        tokens = tokenizer(
+            sentences, padding="max_length" if siglip else True, max_length=length, truncation=True, return_tensors="pt"
+        )
+        return _vector(module.get_text_features(**tokens.to(module.device)))
+
+    return Network(module, _Preprocess(processor), encode_images, encode_texts)
+
+
+def _vector(output: Any) -> torch.Tensor:
+    """Return what a model says of its whole input, (N, D), of whatever its version returns."""
+    if isinstance(output, torch.Tensor):
+        return output
+    pooled = getattr(output, "pooler_output", None)
+    vector: torch.Tensor = output.last_hidden_state[:, 0] if pooled is None else pooled
+    return vector
