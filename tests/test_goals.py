@@ -77,7 +77,9 @@ def test_a_damaged_picture_is_refused_by_its_name(folder: Path) -> None:
 
 @pytest.mark.parametrize("spec", ["/no/such/folder", "drawing", "same_scene", "visual-tasks"])
 def test_a_goal_that_is_nothing_known_is_refused_with_all_the_kinds(spec: str) -> None:
-    expected = rf"unknown goal '{spec}': .*'same-scene', 'drawings', 'visual-tasks:real_imgs', 'text:START -> GOAL'"
+    expected = (
+        rf"unknown goal '{spec}': .*'same-scene', 'drawings', 'visual-tasks:real_imgs', 'text', 'text:START -> GOAL'"
+    )
     with pytest.raises(BadInput, match=expected):
         read_goal(spec, MICRO)
 
@@ -142,6 +144,16 @@ def test_sentences_are_split_into_starts_and_goals() -> None:
 def test_a_text_goal_needs_two_sides(spec: str) -> None:
     with pytest.raises(BadInput, match="must look like 'text:closed microwave -> open microwave', got"):
         read_goal(spec, MICRO)
+
+
+def test_a_task_has_its_own_two_sentences() -> None:
+    for task in TASKS.values():
+        goal = read_goal("text", task)
+        assert (goal.name, goal.starts, goal.goals) == ("text", (task.start_text,), (task.goal_text,))
+    assert (
+        read_goal("text", MICRO).fingerprint()
+        == read_goal("text:closed microwave->open microwave", MICRO).fingerprint()
+    )
 
 
 def test_a_side_without_any_sentence_is_refused() -> None:

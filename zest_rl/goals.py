@@ -7,7 +7,8 @@ A spec is one string:
 - a folder with ``init/`` and ``goal/``, each holding one or more pictures;
 - ``visual-tasks:real_imgs`` or ``visual-tasks:drawings``: the task's folder in the paper's Visual Tasks Dataset, which
   the environment variable ZEST_VISUAL_TASKS points to;
-- ``text:closed microwave -> open microwave`` (several sentences are separated by ``|``).
+- ``text:closed microwave -> open microwave`` (several sentences are separated by ``|``);
+- ``text``: the task's own two sentences.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from zest_rl.images import list_images, read_image
 from zest_rl.tasks import Task
 from zest_rl.types import Frame
 
-SAME_SCENE, DRAWINGS, VISUAL_TASKS, TEXT = "same-scene", "drawings", "visual-tasks:", "text:"
+SAME_SCENE, DRAWINGS, VISUAL_TASKS, OWN_TEXT, TEXT = "same-scene", "drawings", "visual-tasks:", "text", "text:"
 VISUAL_TASKS_VARIABLE = "ZEST_VISUAL_TASKS"
 
 
@@ -102,7 +103,7 @@ def goal_folder(spec: str, task: Task) -> Path | None:
     Raises:
         BadInput: there is no such folder, or the spec is none of the kinds.
     """
-    if spec == SAME_SCENE or spec.startswith(TEXT):
+    if spec in (SAME_SCENE, OWN_TEXT) or spec.startswith(TEXT):
         return None
     if spec == DRAWINGS:
         return _drawings(task)
@@ -112,7 +113,7 @@ def goal_folder(spec: str, task: Task) -> Path | None:
     if not folder.exists():
         raise BadInput(
             f"unknown goal {spec!r}: it is neither {SAME_SCENE!r}, {DRAWINGS!r}, '{VISUAL_TASKS}real_imgs', "
-            "'text:START -> GOAL', nor an existing folder with init/ and goal/"
+            "'text', 'text:START -> GOAL', nor an existing folder with init/ and goal/"
         )
     return folder
 
@@ -143,7 +144,7 @@ def read_goal(spec: str, task: Task, scene: tuple[NDArray[np.uint8], NDArray[np.
 
     Args:
         spec: see the module's docstring.
-        task: for ``drawings``.
+        task: for specs that are different things for each task.
         scene: (V, H, W, 3) start and goal frames of the scene itself, needed for ``same-scene``.
 
     Raises:
@@ -153,6 +154,8 @@ def read_goal(spec: str, task: Task, scene: tuple[NDArray[np.uint8], NDArray[np.
         if scene is None:
             raise BadInput(f"goal {SAME_SCENE!r} needs frames of the scene")
         return GoalSpec(spec, tuple(scene[0]), tuple(scene[1]), per_view=True)
+    if spec == OWN_TEXT:
+        return GoalSpec(spec, (task.start_text,), (task.goal_text,))
     folder = goal_folder(spec, task)
     return read_text(spec) if folder is None else read_folder(folder, spec)
 

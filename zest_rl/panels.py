@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from zest_rl import artifacts, data, metrics
 from zest_rl.evaluation import Evaluation, evaluation_folder
+from zest_rl.goals import read_goal
 from zest_rl.images import list_images, read_image
 from zest_rl.relabel import GOAL_FOLDER
 from zest_rl.report import EpisodePanel, GoalPanel, Scatter
 from zest_rl.scorer import Scorer
+from zest_rl.tasks import get_task
 from zest_rl.types import FloatArray
 from zest_rl.videos import FPS, Film, Video, representative
 
@@ -38,8 +40,8 @@ def goal_panel(name: str, dataset_id: str, scatter: Scatter) -> GoalPanel:
     if folder.is_dir():
         start, goal = (tuple(read_image(path) for path in list_images(folder / part)) for part in ("init", "goal"))
         return GoalPanel(name, start, goal, scatter.spearman, len(scatter.gt_returns))
-    sides = [side.strip() for side in config["goal"].removeprefix("text:").split("->")]
-    return GoalPanel(name, (sides[0],), (sides[-1],), scatter.spearman, len(scatter.gt_returns))
+    sentences = read_goal(config["goal"], get_task(config["views"]["task"]))
+    return GoalPanel(name, sentences.starts, sentences.goals, scatter.spearman, len(scatter.gt_returns))
 
 
 def episode_panels(name: str, evaluation: Evaluation, scorer: Scorer | None, film: Film) -> list[EpisodePanel]:

@@ -17,7 +17,8 @@ class Config:
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
     """Minari dataset with recorded simulator state."""
     goal: str = "same-scene"
-    """Folder with init/ and goal/ pictures, "drawings", "same-scene", or "text:closed microwave -> open microwave"."""
+    """Folder with init/ and goal/ pictures, "drawings", "same-scene", "text" (the task's own sentences), or
+    "text:closed microwave -> open microwave"."""
     embedder: str = "efficientnet-lite0"
     """Frozen network: efficientnet-lite0, open_clip:MODEL/PRETRAINED, torchvision:resnet50, timm:NAME, …@/path,
     transformers:/folder, or a family that another package registers."""
