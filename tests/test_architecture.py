@@ -18,10 +18,11 @@ ROOT = PACKAGE.parent
 ORDER = (
     "load_order", "errors", "types", "artifacts", "parallel", "tasks", "data", "data_writer", "metrics", "quality",
     "envs", "arm", "experts", "collect",
-    "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "relabel", "agents",
+    "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "selection",
+    "candidates", "relabel", "agents",
     "checkpoints", "training", "evaluation", "report", "panels", "comparison", "inspection",
-    "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.inspect", "cli.train",
-    "cli.evaluate", "cli.report", "cli.plans", "cli.reproduce",
+    "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.inspect", "cli.select",
+    "cli.train", "cli.evaluate", "cli.report", "cli.plans", "cli.reproduce",
 )  # fmt: skip
 """The pipeline: a module imports only what stands before it. A folder is listed once, its files share the place."""
 

@@ -191,6 +191,25 @@ class Scorer:
             scores[rows] = self._score(frames)[1:]
         return scores
 
+    def score_pairs(
+        self,
+        first: NDArray[np.float64],
+        current: NDArray[np.float64],
+        on_progress: Callable[[int, int], None] | None = None,
+    ) -> FloatArray:
+        """Score many states, each against a start of its own; all cores embed.
+
+        Args:
+            first: (N, nq) their x_0.
+            current: (N, nq).
+            on_progress: called with (parts embedded, parts in all).
+
+        Returns:
+            (N,) float32 scores.
+        """
+        self.states.embed(np.concatenate([first, current]), on_progress)
+        return self.score_now(first, current)
+
     def _score(self, embeddings: FloatArray) -> FloatArray:
         """(n, V, D) embeddings, the first of x_0 → (n,) scores."""
         return score_views(embeddings, self.starts, self.goals, self.config.features, self.config.similarity)

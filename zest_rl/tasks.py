@@ -26,6 +26,8 @@ class Task:
     """Camera elevations of the ring of views, in degrees; negative looks down."""
     goal_folder: str
     """Folder of this task in the Visual Tasks Dataset."""
+    action: str
+    """What is done, whatever it is done to: tasks with the same action are equal to action selection."""
     start_text: str
     goal_text: str
 
@@ -34,17 +36,17 @@ TASKS: dict[str, Task] = {
     task.name: task
     for task in (
         Task("knob2", "knob_Joint_2", -0.88, (-0.22, 0.5, 2.12), (-20, -35), "turn_on_stove",
-             "stove turned off", "stove turned on"),
+             "turn on", "stove turned off", "stove turned on"),
         Task("knob3", "knob_Joint_3", -0.90, (0.2, 0.75, 1.65), (-25, -40), "turn_on_stove",
-             "stove turned off", "stove turned on"),
+             "turn on", "stove turned off", "stove turned on"),
         Task("ldoor", "left_hinge_cabinet", -1.25, (-0.82, 0.45, 2.6), (-10, -30), "open_cabinet",
-             "closed cabinet", "open cabinet"),
+             "open", "closed cabinet", "open cabinet"),
         Task("rdoor", "right_hinge_cabinet", 1.45, (-0.36, 0.45, 2.6), (-10, -30), "open_cabinet",
-             "closed cabinet", "open cabinet"),
+             "open", "closed cabinet", "open cabinet"),
         Task("sdoor", "slide_cabinet", 0.37, (0.12, 0.45, 2.6), (-10, -30), "open_sliding_door",
-             "closed sliding door", "open sliding door"),
+             "open", "closed sliding door", "open sliding door"),
         Task("micro", "microwave", -0.75, (-0.87, 0.33, 1.8), (-10, -30), "open_microwave",
-             "closed microwave", "open microwave"),
+             "open", "closed microwave", "open microwave"),
     )
 }  # fmt: skip
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from zest_rl.cli.ui import Ui
+from zest_rl.cli.ui import Ui, progress_in_parts
 
 
 @dataclass(frozen=True)
@@ -73,15 +73,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         config.precision,
         config.goal_share,
     )
-    with ui.progress("rendering and embedding", 100) as advance:
-        shown = 0
-
-        def on_progress(done: int, total: int) -> None:
-            nonlocal shown
-            percent = 100 * done // total
-            advance(percent - shown)
-            shown = percent
-
+    with progress_in_parts(ui, "rendering and embedding") as on_progress:
         relabeled = relabel(
             config.dataset,
             scorer_config,

@@ -117,6 +117,21 @@ class StreamUi:
         yield advance
 
 
+@contextmanager
+def progress_in_parts(ui: Ui, description: str) -> Iterator[Callable[[int, int], None]]:
+    """Show progress in percent; yield a function of (parts done, parts in all) for work that tells its size late."""
+    with ui.progress(description, 100) as advance:
+        shown = 0
+
+        def on_progress(done: int, total: int) -> None:
+            nonlocal shown
+            percent = max(shown, 100 * done // total)  # the next stage of the work starts anew
+            advance(percent - shown)
+            shown = percent
+
+        yield on_progress
+
+
 def _progress_bars(stream: TextIO) -> Progress:
     from rich import progress
     from rich.console import Console

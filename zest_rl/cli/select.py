@@ -1,0 +1,140 @@
+"""``zest select goals`` and ``zest select actions``: does a goal find the frames that reach it in a dataset?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+import tyro
+
+from zest_rl.cli.ui import Ui, progress_in_parts
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """What both selections need."""
+
+    what: ClassVar[str]
+    datasets: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="DATASET [DATASET …]")]
+    """Kitchen datasets whose frames are the candidates: one (narrow) or several tasks (diverse)."""
+    task: str | None = None
+    """What the goal is of; default the task of the first dataset."""
+    goal: str = "same-scene"
+    """As in `zest relabel`."""
+    embedder: str = "efficientnet-lite0"
+    """As in `zest relabel`."""
+    features: Literal["delta", "raw"] = "delta"
+    """Compare changes against x_0, or the frames themselves."""
+    similarity: Literal["cos", "l2"] = "cos"
+    """Cosine, or minus the Euclidean distance."""
+    views: int = 8
+    """Cameras around the object; scores are averaged over them."""
+    show_robot: bool = False
+    """Keep the robot in view (the paper removes it)."""
+    tolerance: float = 1e-3
+    """As in `zest relabel`."""
+    top: int = 25
+    """N of the Top-N success rate; at most as many as candidates satisfy the goal."""
+    n_frames: int = 500
+    """Candidates drawn from each dataset."""
+    n_goals: int | None = None
+    """Pictures of the goal drawn per repeat; default all."""
+    n_repeats: int = 5
+    """Samples of the goal's pictures and of x_0 to average over; 1 when nothing is drawn."""
+    seed: int = 0
+    """Of the candidates."""
+    precision: Literal["auto", "fp32", "bf16"] = "auto"
+    """Of the embedder."""
+    n_workers: int | None = None
+    """Processes; default one per core."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GoalArguments(Arguments):
+    """Goal selection (Cui et al. §4.1): do the frames that score highest reach the goal?"""
+
+    what: ClassVar[str] = "goals"
+    context: Literal["same", "different"] = "same"
+    """x_0 of a candidate: of its own trajectory, or of another one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActionArguments(Arguments):
+    """Action selection (Cui et al. §4.2): is what happens in the frames that score highest the goal's action, done to
+    whatever object? Opening a cabinet counts for opening the microwave.
+    """
+
+    what: ClassVar[str] = "actions"
+
+
+CONFIGS = {config.what: config for config in (GoalArguments, ActionArguments)}
+
+
+def run(config: Arguments, ui: Ui) -> dict[str, Any]:
+    """Draw candidates, score them, judge the highest scores."""
+    from functools import partial
+
+    from zest_rl import data, selection
+    from zest_rl.candidates import draw_candidates, score_as_actions, score_as_goals
+    from zest_rl.errors import BadInput
+    from zest_rl.frames import Views
+    from zest_rl.scorer import ScorerConfig
+    from zest_rl.tasks import get_task
+
+    if not config.datasets:
+        raise BadInput("`zest select` needs at least 1 dataset; `zest collect` makes them")
+    task = get_task(config.task or data.task_name(config.datasets[0]))
+    candidates = draw_candidates(config.datasets, config.n_frames, config.seed)
+    satisfies = candidates.satisfies(task) if isinstance(config, GoalArguments) else candidates.does(task)
+    if satisfies.sum() < config.top:
+        raise BadInput(
+            f"only {satisfies.sum()} of {len(satisfies)} candidates satisfy the goal of {task.name!r}, so the highest "
+            f"{config.top} could not all; give more --n-frames, a smaller --top, or a dataset with more successes"
+        )
+    views = Views(task.name, config.views, robot=config.show_robot, tolerance=config.tolerance)
+    scorer = ScorerConfig(views, config.goal, config.embedder, config.features, config.similarity, config.precision)
+    drawn = config.n_goals is not None or (isinstance(config, GoalArguments) and config.context == "different")
+    options: dict[str, Any] = {
+        "n_repeats": config.n_repeats if drawn else 1, "n_goals": config.n_goals, "n_workers": config.n_workers,
+    }  # fmt: skip
+    with progress_in_parts(ui, "rendering and embedding") as on_progress:
+        if isinstance(config, GoalArguments):
+            scores = score_as_goals(candidates, scorer, context=config.context, on_progress=on_progress, **options)
+        else:
+            scores = score_as_actions(candidates, scorer, on_progress=on_progress, **options)
+    top = partial(selection.top_n_success, n=config.top)
+    found = {
+        name: selection.over_trajectories(measure, scores, satisfies, candidates.trajectory)
+        for name, measure in (("top_n_success", top), ("relative_variation", selection.relative_variation))
+    }
+    chance = selection.goal_frame_ratio(satisfies)
+    return {
+        "select": config.what,
+        "task": task.name,
+        "goal": config.goal,
+        "top": config.top,
+        **{name: {"value": one.value, "ci95": [one.low, one.high]} for name, one in found.items()},
+        "goal_frame_ratio": chance,
+        "times_random": found["top_n_success"].value / chance,
+        "n_candidates": len(satisfies),
+        "n_satisfying": int(satisfies.sum()),
+    }
+
+
+def summary(result: Mapping[str, Any]) -> str:
+    """What was found, as text."""
+
+    def figure(name: str) -> str:
+        low, high = result[name]["ci95"]
+        return f"{result[name]['value']:.1%}  [{low:.1%}, {high:.1%}]"
+
+    return "\n".join(
+        [
+            f"{result['task']} by {result['goal']}: "
+            f"{result['n_satisfying']} of {result['n_candidates']} candidates satisfy it",
+            f"  Top-{result['top']} success      {figure('top_n_success')}",
+            f"  picking at random   {result['goal_frame_ratio']:.1%}  ({result['times_random']:.1f} times as good)",
+            f"  total variation     {figure('relative_variation')} of the largest",
+        ]
+    )
