@@ -9,7 +9,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zest_rl.errors import BadInput
-from zest_rl.scores import ZERO_DELTA, pair_starts, score_delta, score_raw, score_views, zero_deltas
+from zest_rl.scores import (
+    LOGIT_SCALE,
+    PROJECTED,
+    ZERO_DELTA,
+    check_names,
+    pair_starts,
+    score_classifier,
+    score_delta,
+    score_progress,
+    score_projection,
+    score_raw,
+    score_views,
+    zero_deltas,
+)
 
 Vector = Sequence[float]
 Case = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -73,6 +86,53 @@ def test_scores_are_those_of_a_plain_loop_over_the_formulas(case: Case, features
     np.testing.assert_allclose(scores, naive(case, features, similarity), atol=1e-5)
     assert scores.shape == (len(case[0]),)
     assert scores.dtype == np.float32
+
+
+def unit(vector: Vector) -> Vector:
+    length = math.hypot(*vector)
+    return [x / length for x in vector]
+
+
+def naive_peer(features: str, x: Vector, x_0: Vector, start: Vector, goal: Vector) -> float:
+    if features == "progress":
+        return 1 - math.dist(x, goal) / math.dist(x_0, goal)
+    if features == "classifier":
+        odds = [math.exp(LOGIT_SCALE * (cos(x, side) - 1)) for side in (start, goal)]
+        return odds[1] / sum(odds)
+    x, start, goal = unit(x), unit(start), unit(goal)
+    away, way = minus(x, goal), minus(goal, start)
+    if not any(way):
+        return 1 - math.hypot(*[(1 - PROJECTED) * a for a in away]) ** 2 / 2
+    share = sum(a * w for a, w in zip(away, way, strict=True)) / math.hypot(*way) ** 2
+    rest = [PROJECTED * share * w + (1 - PROJECTED) * a for a, w in zip(away, way, strict=True)]
+    return 1 - math.hypot(*rest) ** 2 / 2
+
+
+@pytest.mark.parametrize("features", ["projection", "progress", "classifier"])
+@given(case=cases())
+def test_rewards_to_compare_with_are_those_of_a_plain_loop(case: Case, features: str) -> None:
+    frames, starts, goals = (array.astype(np.float64) for array in case)
+    expected = np.zeros(len(frames))
+    for view in range(frames.shape[1]):
+        own_starts, own_goals = (rows[view] if rows.ndim == 3 else rows for rows in (starts, goals))
+        for goal in own_goals.tolist():
+            start = max(own_starts.tolist(), key=lambda s: cos(s, goal))
+            for t, frame in enumerate(frames[:, view].tolist()):
+                value = naive_peer(features, frame, frames[0, view].tolist(), start, goal)
+                expected[t] += value / len(own_goals) / frames.shape[1]
+    scores = score_views(*case, features)  # type: ignore[arg-type]
+    np.testing.assert_allclose(scores, expected, atol=1e-4)
+
+
+def test_rewards_to_compare_with_end_best_at_the_goal() -> None:
+    start, goal = np.array([[1.0, 0.2, 0.1]], np.float32), np.array([[0.1, 1.0, 0.3]], np.float32)
+    frames = np.concatenate([start, (start + goal) / 2, goal])
+    assert score_progress(frames, goal) == pytest.approx([0, 0.5, 1])
+    assert score_classifier(frames, start, goal)[[0, 2]] == pytest.approx([0, 1], abs=1e-6)
+    projected = score_projection(frames, start, goal)
+    assert (np.diff(projected) > 0).all()
+    assert projected[-1] == pytest.approx(1)
+    assert score_progress(goal, goal) == [0], "an episode that starts at the goal"
 
 
 @FEATURES
@@ -195,3 +255,7 @@ def test_an_unknown_feature_or_similarity_is_refused_with_the_nearest_right_one(
         score_views(FRAMES[:, None], ONE, ONE, "deltas")  # type: ignore[arg-type]
     with pytest.raises(BadInput, match="unknown similarity 'cosine'; did you mean 'cos'"):
         score_delta(FRAMES, ONE, ONE, "cosine")  # type: ignore[arg-type]
+    with pytest.raises(BadInput, match="unknown similarity 'cosine'; did you mean 'cos'"):
+        check_names("raw", "cosine")
+    with pytest.raises(BadInput, match="features 'progress' bring a similarity of their own, got 'l2'"):
+        score_views(FRAMES[:, None], ONE, ONE, "progress", "l2")

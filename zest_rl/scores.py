@@ -6,7 +6,7 @@ x_0 the first frame of the episode (alignment: `zest_rl.types`).
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,30 @@ from zest_rl.errors import BadInput, nearest
 from zest_rl.types import FloatArray
 
 Doubles = NDArray[np.float64]
-Features = Literal["raw", "delta"]
+Features = Literal["raw", "delta", "projection", "progress", "classifier"]
+"""Of the paper the first two; the others are rewards to compare with, which bring a similarity of their own."""
 Similarity = Literal["cos", "l2"]
+PROJECTED = 0.5
+"""α of `score_projection`: 0 is the plain distance to the goal, 1 sees nothing but the way from start to goal."""
+LOGIT_SCALE = 100.0
+"""What CLIP multiplies its cosines by before a softmax."""
 
 ZERO_DELTA = 1e-6
 """A change not longer than this times the embedding it starts from has no direction: its cosine is defined as 0."""
+
+
+def check_names(features: str, similarity: str) -> None:
+    """Refuse what is not there, and what does not go together.
+
+    Raises:
+        BadInput: an unknown name, or a similarity for features that bring one of their own.
+    """
+    if features not in get_args(Features):
+        raise BadInput(f"unknown features {features!r}; {nearest(features, get_args(Features))}")
+    if similarity not in get_args(Similarity):
+        raise BadInput(f"unknown similarity {similarity!r}; {nearest(similarity, get_args(Similarity))}")
+    if similarity != "cos" and features not in ("delta", "raw"):
+        raise BadInput(f"features {features!r} bring a similarity of their own, got {similarity!r}; leave it at 'cos'")
 
 
 def _check(name: str, embeddings: FloatArray, dim: int | None = None) -> Doubles:
@@ -124,11 +143,74 @@ def score_delta(
     Raises:
         BadInput: shapes do not fit, or a value is not finite.
     """
+    frames, goals, starts = _checked(frame_embeddings, start_embeddings, goal_embeddings)
+    wanted = _change(goals, starts)
+    return _mean_over_goals(_similarity(_change(frames, frames[0]), wanted, similarity))
+
+
+def _unit(rows: Doubles) -> Doubles:
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.asarray(np.divide(rows, lengths, out=np.zeros_like(rows), where=lengths > 0))
+
+
+def _checked(
+    frame_embeddings: FloatArray, start_embeddings: FloatArray, goal_embeddings: FloatArray
+) -> tuple[Doubles, Doubles, Doubles]:
+    """Return frames (T+1, D), goals (K, D), and for each goal the start that it is paired with (K, D)."""
     frames = _check("frame_embeddings", frame_embeddings)
     starts = _check("start_embeddings", start_embeddings, frames.shape[1])
     goals = _check("goal_embeddings", goal_embeddings, frames.shape[1])
-    wanted = _change(goals, starts[_pairs(starts, goals)])
-    return _mean_over_goals(_similarity(_change(frames, frames[0]), wanted, similarity))
+    return frames, goals, starts[_pairs(starts, goals)]
+
+
+def score_projection(
+    frame_embeddings: FloatArray, start_embeddings: FloatArray, goal_embeddings: FloatArray
+) -> FloatArray:
+    """Goal-baseline regularised similarity: 1 − ½ ‖(αP + (1−α)I)(x − g)‖², averaged over goals.
+
+    x and g are unit vectors, b the unit vector of the start that g is paired with, P the projection onto g − b, α
+    `PROJECTED`. Rocamonde et al. 2023, https://arxiv.org/abs/2310.12921, with pictures or sentences alike.
+
+    Args, Returns, Raises: see `score_delta`; scores are at most 1.
+    """
+    frames, goals, starts = (_unit(rows) for rows in _checked(frame_embeddings, start_embeddings, goal_embeddings))
+    similarities = []
+    for goal, start in zip(goals, starts, strict=True):
+        away, way = frames - goal, goal - start
+        squared = way @ way
+        along = np.outer(away @ way, way) / squared if squared > 0 else np.zeros_like(away)
+        rest = PROJECTED * along + (1 - PROJECTED) * away
+        similarities.append(1 - (rest**2).sum(axis=1) / 2)
+    return _mean_over_goals(np.stack(similarities, axis=1))
+
+
+def score_progress(frame_embeddings: FloatArray, goal_embeddings: FloatArray) -> FloatArray:
+    """Share of the distance to the goal that is covered: 1 − ‖x_t − g‖ / ‖x_0 − g‖, averaged over goals.
+
+    The distance that VIP rewards (Ma et al. 2023, https://arxiv.org/abs/2210.00030), as a ratio so that embedders and
+    goals of other scales compare. An episode that starts at the goal scores minus the distance from there.
+
+    Args, Returns, Raises: see `score_raw`; the first score is 0, 1 is the goal.
+    """
+    frames = _check("frame_embeddings", frame_embeddings)
+    goals = _check("goal_embeddings", goal_embeddings, frames.shape[1])
+    distances = -_similarity(frames, goals, "l2")
+    whole = np.where(distances[0] > 0, distances[0], 1.0)
+    return _mean_over_goals((distances[0] - distances) / whole)
+
+
+def score_classifier(
+    frame_embeddings: FloatArray, start_embeddings: FloatArray, goal_embeddings: FloatArray
+) -> FloatArray:
+    """Probability of the goal against the start it is paired with: softmax of `LOGIT_SCALE` · cosines, mean over goals.
+
+    The plain success classifier by a pair of sentences or pictures.
+
+    Args, Returns, Raises: see `score_delta`; scores are in [0, 1].
+    """
+    frames, goals, starts = _checked(frame_embeddings, start_embeddings, goal_embeddings)
+    margin = LOGIT_SCALE * (_cos(frames, goals) - _cos(frames, starts))
+    return _mean_over_goals(1 / (1 + np.exp(-margin)))
 
 
 def zero_deltas(frame_embeddings: FloatArray) -> NDArray[np.bool_]:
@@ -150,14 +232,15 @@ def score_views(
         frame_embeddings: (T+1, V, D) embeddings of V views of each frame.
         start_embeddings: (S, D), the same for all views, or (V, S, D), each view its own.
         goal_embeddings: (K, D) or (V, K, D).
-        features: ``"delta"`` (Eq. 2) or ``"raw"`` (Eq. 1, which does not use the starts).
-        similarity: as in `score_delta`.
+        features: ``"delta"`` (Eq. 2), ``"raw"`` (Eq. 1, which does not use the starts), or a reward to compare with:
+            ``"projection"``, ``"progress"``, ``"classifier"``.
+        similarity: as in `score_delta`; leave it at ``"cos"`` for the last three.
 
     Returns:
         (T+1,) float32 scores.
 
     Raises:
-        BadInput: shapes do not fit, a value is not finite, or a name is unknown.
+        BadInput: shapes do not fit, a value is not finite, or the names are unknown or do not go together.
     """
     frames = np.asarray(frame_embeddings)
     if frames.ndim != 3 or frames.shape[1] == 0:
@@ -166,6 +249,7 @@ def score_views(
     for name, goals in (("start_embeddings", start_embeddings), ("goal_embeddings", goal_embeddings)):
         if goals.ndim == 3 and len(goals) != n_views:
             raise BadInput(f"{name} must hold one set for each of the {n_views} views, got {len(goals)}")
+    check_names(features, similarity)
     total = np.zeros(len(frames), dtype=np.float64)
     for view in range(n_views):
         starts = start_embeddings[view] if start_embeddings.ndim == 3 else start_embeddings
@@ -174,6 +258,10 @@ def score_views(
             total += score_delta(frames[:, view], starts, goals, similarity)
         elif features == "raw":
             total += score_raw(frames[:, view], goals, similarity)
+        elif features == "projection":
+            total += score_projection(frames[:, view], starts, goals)
+        elif features == "progress":
+            total += score_progress(frames[:, view], goals)
         else:
-            raise BadInput(f"unknown features {features!r}; {nearest(features, ('delta', 'raw'))}")
+            total += score_classifier(frames[:, view], starts, goals)
     return np.asarray(total / n_views, dtype=np.float32)

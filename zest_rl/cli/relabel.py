@@ -22,8 +22,9 @@ class Config:
     embedder: str = "efficientnet-lite0"
     """Frozen network: efficientnet-lite0, open_clip:MODEL/PRETRAINED, torchvision:resnet50, timm:NAME, …@/path,
     transformers:/folder, or a family that another package registers."""
-    features: Literal["delta", "raw"] = "delta"
-    """Compare changes against the start, or the frames themselves."""
+    features: Literal["delta", "raw", "projection", "progress", "classifier"] = "delta"
+    """Compare changes against the start, or the frames themselves; or a reward to compare with: VLM-RM's regularised
+    similarity, the share of the distance to the goal that is covered, a classifier of goal against start."""
     similarity: Literal["cos", "l2"] = "cos"
     """Cosine, or minus the Euclidean distance."""
     reward: Literal["level", "difference"] = "level"

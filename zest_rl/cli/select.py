@@ -24,8 +24,9 @@ class Arguments:
     """As in `zest relabel`."""
     embedder: str = "efficientnet-lite0"
     """As in `zest relabel`."""
-    features: Literal["delta", "raw"] = "delta"
-    """Compare changes against x_0, or the frames themselves."""
+    features: Literal["delta", "raw", "projection", "progress", "classifier"] = "delta"
+    """Compare changes against the start, or the frames themselves; or a reward to compare with: VLM-RM's regularised
+    similarity, the share of the distance to the goal that is covered, a classifier of goal against start."""
     similarity: Literal["cos", "l2"] = "cos"
     """Cosine, or minus the Euclidean distance."""
     views: int = 8
