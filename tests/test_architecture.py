@@ -22,7 +22,8 @@ ORDER = (
     "candidates", "relabel", "agents",
     "checkpoints", "training", "evaluation", "report", "panels", "comparison", "inspection",
     "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.inspect", "cli.select",
-    "cli.train", "cli.evaluate", "cli.report", "cli.plans", "cli.reproduce",
+    "cli.train", "cli.evaluate", "cli.report", "cli.plans", "cli.studies",
+    "cli.reproduce",
 )  # fmt: skip
 """The pipeline: a module imports only what stands before it. A folder is listed once, its files share the place."""
 

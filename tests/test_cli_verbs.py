@@ -15,6 +15,7 @@ from zest_rl.cli import collect as collect_verb
 from zest_rl.cli import train
 from zest_rl.cli.plans import read_plan
 from zest_rl.cli.recipes import parse_config
+from zest_rl.cli.studies import read_study
 
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = ["--hidden-size", "16", "--n-layers", "1", "--n-updates", "4", "--log-every", "2", "--threads", "1"]
@@ -135,6 +136,12 @@ def test_a_recipe_of_a_table_is_valid_and_found_from_anywhere(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ZEST_VISUAL_TASKS", str(tmp_path))
+    if "\nstudy = " in path.read_text():
+        study = read_study(Path("eval") / path.name)
+        assert study.study.title
+        assert study.settings
+        assert study.collect
+        return
     plan = read_plan(Path("eval") / path.name)
     assert plan.recipe.title
     assert plan.methods.keys() == plan.recipe.methods.keys()

@@ -142,7 +142,7 @@ def read_plan(path: Path) -> Plan:
     goals = {}
     for name, goal in recipe.goals.items():
         where = f"recipe {path} [goals.{name!r}]"
-        table = {**_table(recipe.relabel, where, "dataset"), **_table(goal, where, "dataset"), "dataset": ""}
+        table = {**table_of(recipe.relabel, where, "dataset"), **table_of(goal, where, "dataset"), "dataset": ""}
         goals[name] = load_config(relabel.Config, table, where)
     methods = {
         name: _plan_method(recipe, method, goals, f"recipe {path} [methods.{name!r}]")
@@ -155,27 +155,32 @@ def read_plan(path: Path) -> Plan:
         raise BadInput(
             f"recipe {path} [train]: no method has the agent {', '.join(sorted(unused))}; leave its table out"
         )
-    collected = _plan_tasks(recipe, f"recipe {path}")
+    collected = plan_tasks(recipe.collect, recipe.tasks, f"recipe {path}")
     for name, config in goals.items():
         for collect_config in collected.values():
-            with _at(f"recipe {path} [goals.{name!r}]"):
+            with located(f"recipe {path} [goals.{name!r}]"):
                 goal_folder(config.goal, get_task(collect_config.task))
     return Plan(recipe, collected, goals, methods)
 
 
-def _plan_tasks(recipe: Recipe, where: str) -> dict[str, Any]:
+def plan_tasks(collect: Mapping[str, Any], tasks: Mapping[str, Mapping[str, Any]], where: str) -> dict[str, Any]:
+    """Read the tables [collect] and [tasks.NAME] of a recipe: task → config of `zest collect`.
+
+    Raises:
+        BadInput: a table is wrong, or tasks do not have as many episodes and a dataset of their own.
+    """
     from zest_rl.cli.collect import Config
     from zest_rl.cli.recipes import load_config
 
-    if not recipe.tasks:
-        config = load_config(Config, recipe.collect, f"{where} [collect]")
+    if not tasks:
+        config = load_config(Config, collect, f"{where} [collect]")
         collected = {config.task: config}
     else:
-        shared = _table(recipe.collect, f"{where} [collect]", "task")
+        shared = table_of(collect, f"{where} [collect]", "task")
         collected = {}
-        for name, table in recipe.tasks.items():
+        for name, table in tasks.items():
             here = f"{where} [tasks.{name}]"
-            collected[name] = load_config(Config, {**shared, "task": name, **_table(table, here)}, here)
+            collected[name] = load_config(Config, {**shared, "task": name, **table_of(table, here)}, here)
     sizes, ids = {config.n_episodes for config in collected.values()}, {c.dataset_id for c in collected.values()}
     if len(sizes) > 1 or len(ids) < len(collected):
         raise BadInput(
@@ -188,7 +193,7 @@ def _plan_tasks(recipe: Recipe, where: str) -> dict[str, Any]:
             raise BadInput(
                 f"{where} [tasks.{name!r}]: the name becomes a file's beside report.html; use letters, digits, - and _"
             )
-        with _at(f"{where} [{'tasks' if recipe.tasks else 'collect'}]"):
+        with located(f"{where} [{'tasks' if tasks else 'collect'}]"):
             config.behaviour()
     return collected
 
@@ -201,7 +206,7 @@ def _plan_method(recipe: Recipe, method: Mapping[str, Any], goals: Mapping[str, 
     own = {key: value for key, value in method.items() if key in (f.name for f in fields(Entry))}
     flags = {key: value for key, value in method.items() if key not in own}
     entry = load_config(Entry, own, where)
-    with _at(where):
+    with located(where):
         get_agent(entry.agent)
     if entry.goal is not None and entry.goal not in goals:
         raise BadInput(f"{where}: unknown goal {entry.goal!r}; {nearest(entry.goal, goals)}")
@@ -209,17 +214,17 @@ def _plan_method(recipe: Recipe, method: Mapping[str, Any], goals: Mapping[str, 
     shared = {key: value for key, value in recipe.train.items() if key not in of_agents}
     training = {"n_updates": 5000, "threads": 1, "device": "cpu"}
     for table in (shared, of_agents.get(entry.agent, {}), flags):
-        training |= _table(table, where, "dataset", "seed", "run_dir")
+        training |= table_of(table, where, "dataset", "seed", "run_dir")
     load_config(train.CONFIGS[entry.agent], {**training, "dataset": ""}, where)
-    arguments = {**_table(recipe.evaluate, where, "run"), **_table(entry.evaluate, where, "run")}
+    arguments = {**table_of(recipe.evaluate, where, "run"), **table_of(entry.evaluate, where, "run")}
     config = load_config(evaluate.Config, {**arguments, "run": ""}, f"{where} [evaluate]")
-    with _at(f"{where} [evaluate]"):
+    with located(f"{where} [evaluate]"):
         evaluation = evaluate.settings(config)
     return PlannedMethod(entry, training, {"n_workers": 1, **arguments}, evaluation)
 
 
 @contextmanager
-def _at(where: str) -> Iterator[None]:
+def located(where: str) -> Iterator[None]:
     """Say in a refusal which part of the recipe it is about."""
     try:
         yield
@@ -227,7 +232,7 @@ def _at(where: str) -> Iterator[None]:
         raise BadInput(f"{where}: {error}") from error
 
 
-def _table(values: Mapping[str, Any], where: str, *given: str) -> dict[str, Any]:
+def table_of(values: Mapping[str, Any], where: str, *given: str) -> dict[str, Any]:
     """Return a table with ``_`` for ``-`` in its keys; refuse those that `zest reproduce` itself gives."""
     table = {key.replace("-", "_"): value for key, value in values.items()}
     clash = sorted(table.keys() & set(given))

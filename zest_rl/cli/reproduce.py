@@ -1,7 +1,7 @@
 """``zest reproduce``: a recipe → collected and relabeled datasets, trained and evaluated methods, tables and reports.
 
-What a recipe may hold is drawn in `zest_rl.cli.plans`. Cells run side by side, one core each; a finished cell is never
-run again.
+What a recipe may hold is drawn in `zest_rl.cli.plans`, and in `zest_rl.cli.studies` for what trains nothing. Cells run
+side by side, one core each; a finished cell is never run again.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from zest_rl.cli import studies
 from zest_rl.cli.plans import Cell, Plan, TaskData, plan_cells, read_plan
+from zest_rl.cli.recipes import read_recipe
 from zest_rl.cli.ui import SilentUi, Ui
 
 if TYPE_CHECKING:
@@ -47,8 +49,13 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     from zest_rl.videos import ensure_videos
 
     started = time.monotonic()
-    plan = read_plan(config.file)
     output = config.output or Path("runs") / config.file.stem
+    if "study" in read_recipe(config.file):
+        return {
+            **studies.run(config.file, output, ui, n_workers=config.n_workers),
+            "seconds": round(time.monotonic() - started, 1),
+        }
+    plan = read_plan(config.file)
     collected, datasets = {}, {}
     for task, collect_config in plan.collect.items():
         collected[task], datasets[task] = _make_datasets(plan, task, collect_config, config.n_workers, ui)
@@ -185,6 +192,8 @@ def _rows(table: tuple[MethodRow, ...]) -> dict[str, Any]:
 
 def summary(result: Mapping[str, Any]) -> str:
     """The table as text."""
+    if "study" in result:
+        return studies.summary(result)
     lines = [
         f"{'':<28}{'% of expert':>12}  {'95 % interval':<18}{'success':>8}{'seeds':>7}{'episodes':>10}{'paper':>8}"
     ]

@@ -1,0 +1,96 @@
+"""Studies: a grid of `zest select` from one recipe, beside the paper's figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zest_rl.cli.studies import markdown, read_study
+from zest_rl.errors import BadInput
+
+RECIPE = """
+study = "goals"
+title = "A tiny study"
+caveats = ["Tiny."]
+
+[collect]
+task = "micro"
+n_episodes = 4
+noise_max = 1.0
+dataset = "zest/kitchen-micro-whole-v0"
+
+[select]
+views = 1
+tolerance = 0.05
+n_frames = 60
+top = 3
+
+[grid]
+pool = ["single", "all"]
+goal = ["same-scene", "drawings"]
+
+[paper]
+"SGSD, CLIP" = { micro = 92.0 }
+"""
+
+
+def write(folder: Path, text: str = RECIPE) -> Path:
+    path = folder / "study.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_study_selects_in_every_cell_and_puts_the_paper_beside(
+    tmp_path: Path, zest: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
+    words = ("reproduce", write(tmp_path), "--output", tmp_path / "out", "--n-workers", "1")
+    result = zest(*words)
+    assert [row["name"] for row in result["rows"]] == [
+        f"pool {pool}, goal {goal}" for pool in ("single", "all") for goal in ("same-scene", "drawings")
+    ]
+    alone = zest(
+        "select", "goals", "zest/kitchen-micro-whole-v0", "--views", 1, "--tolerance", 0.05, "--n-frames", 60,
+        "--top", 3, "--goal", "drawings", "--n-workers", 1,
+    )  # fmt: skip
+    alone.pop("next", None)
+    assert result["rows"][1]["tasks"]["micro"] == alone
+    assert result["rows"][1]["mean"]["top_n_success"] == alone["top_n_success"]["value"]
+    assert result["rows"][3]["tasks"] == result["rows"][1]["tasks"], "of one task, all tasks are the single one"
+    assert result["paper"] == {"SGSD, CLIP": {"micro": 92.0, "mean": 92.0}}
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["rows"] == result["rows"]
+    table = (tmp_path / "out" / "table.md").read_text()
+    assert table == markdown(result)
+    for line in ("| | micro | mean |", "| paper: SGSD, CLIP | 92.0 | 92.0 |", "| at random, pool single |"):
+        assert line in table
+    page = (tmp_path / "out" / "report.html").read_text()
+    for part in ("A tiny study", "paper: SGSD, CLIP", "at random, pool all", "Tiny."):
+        assert part in page
+    assert zest(*words)["rows"] == result["rows"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('study = "goals"', 'study = "goal"', "'study' must be"),
+        ('pool = ["single", "all"]', 'pool = ["every"]', "unknown pool 'every'"),
+        ("top = 3", "tops = 3", "unknown key 'tops'; did you mean 'top'"),
+        ('"drawings"]', '"drawing"]', "unknown goal 'drawing'"),
+        ("micro = 92.0", "sdoor = 92.0", "there is no task 'sdoor' here"),
+        (
+            '[grid]\npool = ["single", "all"]\ngoal = ["same-scene", "drawings"]',
+            "[grid]\npool = []",
+            "at least 1 value",
+        ),
+        ("top = 3", 'task = "micro"', "'task' is not for a recipe to set"),
+    ],
+)
+def test_a_wrong_study_is_refused_before_anything_runs(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert old in RECIPE
+    with pytest.raises(BadInput, match=message):
+        read_study(write(tmp_path, RECIPE.replace(old, new)))
