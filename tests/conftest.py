@@ -30,28 +30,33 @@ def visual_tasks() -> Path:
 COLLECTED = "zest/kitchen-micro-tiny-v0"
 
 
-@pytest.fixture(scope="session")
-def collected_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Minari root with `COLLECTED`: four noisy episodes of the expert, of which one fails. Read-only."""
+def collect_some(dataset_id: str, task: str, n_episodes: int) -> None:
+    """Leave a few noisy episodes of the expert in the Minari root."""
     from zest_rl import collect
     from zest_rl.data_writer import write_dataset
     from zest_rl.parallel import concatenate
 
-    behaviour = collect.Behaviour("micro", "expert", noise_max=1.0)
-    episodes = concatenate([collect.rollout(behaviour, index) for index in range(4)])
+    behaviour = collect.Behaviour(task, "expert", noise_max=1.0)
+    episodes = concatenate([collect.rollout(behaviour, index) for index in range(n_episodes)])
+    write_dataset(
+        dataset_id,
+        collect.recordings(episodes),
+        env_spec=collect.env_spec(task).to_json(),
+        ref_min_score=0.0,
+        ref_max_score=70.0,
+        algorithm_name="scripted expert with uniform action noise",
+        description="a few episodes for tests",
+        zest={"collect": {"asked": {"task": task}}},
+    )
+
+
+@pytest.fixture(scope="session")
+def collected_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Minari root with `COLLECTED`: four noisy episodes of the expert, of which one fails. Read-only."""
     root = tmp_path_factory.mktemp("minari")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MINARI_DATASETS_PATH", str(root))
-        write_dataset(
-            COLLECTED,
-            collect.recordings(episodes),
-            env_spec=collect.env_spec("micro").to_json(),
-            ref_min_score=0.0,
-            ref_max_score=70.0,
-            algorithm_name="scripted expert with uniform action noise",
-            description="four episodes for tests",
-            zest={"collect": {"asked": {"task": "micro"}}},
-        )
+        collect_some(COLLECTED, "micro", 4)
     return root
 
 

@@ -19,8 +19,9 @@ ORDER = (
     "load_order", "errors", "types", "artifacts", "parallel", "tasks", "data", "data_writer", "metrics", "quality",
     "envs", "arm", "experts", "collect",
     "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "selection",
-    "candidates", "relabel", "agents",
+    "relabel", "agents",
     "checkpoints", "training", "evaluation", "report", "panels", "comparison", "inspection",
+    "inspection_page", "candidates",
     "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.inspect", "cli.select",
     "cli.train", "cli.evaluate", "cli.report", "cli.plans", "cli.studies",
     "cli.reproduce",
@@ -131,6 +132,13 @@ def test_the_ground_truth_of_a_dataset_is_read_only_where_reports_are_made() -> 
     for path in SOURCES:
         if "infos/gt" in path.read_text():
             assert module_name(path) in ("data", "data_writer"), "it is read through `read_ground_truth` alone"
+
+
+def test_ground_truth_read_from_states_is_for_judging_alone() -> None:
+    users = {module_name(path) for path in SOURCES if "progress_of" in path.read_text()}
+    assert users == {"envs", "candidates"}
+    importers = {module_name(path) for path in SOURCES if "zest_rl.candidates import" in path.read_text()}
+    assert importers == {"cli.select"}
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=module_name)

@@ -377,5 +377,5 @@ def test_the_task_is_that_of_the_environment(collected: str) -> None:
 @pytest.mark.parametrize("spec", [None, {"id": "Pendulum-v1", "entry_point": "gymnasium.envs.x:Y", "kwargs": {}}])
 def test_a_dataset_of_another_environment_has_no_task(collected: str, spec: dict[str, Any] | None) -> None:
     change_metadata(collected, env_spec=spec and json.dumps(spec))
-    with pytest.raises(BadInput, match="frames can be rendered for zest/Kitchen-v0 only"):
+    with pytest.raises(BadInput, match="frames can be rendered for zest/Kitchen-v1 only"):
         data.task_name(collected)

@@ -349,9 +349,10 @@ from torchvision.transforms.functional import pil_to_tensor
 from zest_rl.embedders.networks import Network
 
 def build(rest):  # what stands after "colour:" in the URI
-    torch.manual_seed(int(rest))
+    torch.manual_seed(0)
+    size = int(rest)
     module = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(4), torch.nn.Flatten(), torch.nn.Linear(48, 16))
-    return Network(module, lambda image: pil_to_tensor(image.resize((32, 32))) / 255, module)
+    return Network(module, lambda image: pil_to_tensor(image.resize((size, size))) / 255, module)
 """
 
 
@@ -374,9 +375,10 @@ def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.usefixtures("plugin")
 def test_an_embedder_registered_by_another_package_embeds(frames: list[np.ndarray]) -> None:
     assert len(PLUGIN.strip().splitlines()) <= 15
-    embedder = load_embedder("colour:3", precision="fp32")
+    embedder = load_embedder("colour:32", precision="fp32")
     assert (embedder.dim, embedder.reads_text, embedder.embed_images(frames).shape) == (16, False, (5, 16))
-    assert load_embedder("colour:4", precision="fp32").fingerprint != embedder.fingerprint
+    other = load_embedder("colour:16", precision="fp32")
+    assert other.fingerprint != embedder.fingerprint, "equal weights, another preprocessing"
     with pytest.raises(BadInput, match=r"unknown embedder 'color:3'.*colour"):
         load_embedder("color:3")
 
@@ -400,7 +402,7 @@ def test_a_registered_embedder_works_in_every_verb(
     collected: str, tmp_path: Path, zest: Callable[..., dict[str, Any]]
 ) -> None:
     relabeled = zest(
-        "relabel", collected, "--embedder", "colour:3", "--views", 2, "--tolerance", 0.05, "--n-workers", 2
+        "relabel", collected, "--embedder", "colour:32", "--views", 2, "--tolerance", 0.05, "--n-workers", 2
     )["dataset"]
     assert zest("inspect", relabeled, "--output", tmp_path / "page.html")["datasets"][relabeled]["figures"]
     small = ("--n-updates", 5, "--hidden-size", 32, "--n-layers", 1, "--context-len", 2)

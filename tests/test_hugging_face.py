@@ -25,13 +25,15 @@ def frames() -> list[np.ndarray]:
     return [rng.integers(0, 256, size=(*size, 3), dtype=np.uint8) for size in ((32, 32), (48, 40), (64, 100))]
 
 
-def save_clip_tokenizer(folder: Path) -> None:
+def save_clip_tokenizer(folder: Path, **options: object) -> None:
     """A tokenizer in CLIP's layout that knows single letters."""
     letters = [*"abcdefghijklmnopqrstuvwxyz", *(f"{c}</w>" for c in "abcdefghijklmnopqrstuvwxyz")]
     vocabulary = {token: i for i, token in enumerate([*letters, "<|startoftext|>", "<|endoftext|>"])}
     (folder / "vocab.json").write_text(json.dumps(vocabulary))
     (folder / "merges.txt").write_text("#version: 0.2\n")
-    transformers.CLIPTokenizer(str(folder / "vocab.json"), str(folder / "merges.txt")).save_pretrained(folder)
+    transformers.CLIPTokenizer(str(folder / "vocab.json"), str(folder / "merges.txt"), **options).save_pretrained(
+        folder
+    )
 
 
 SMALL = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2}
@@ -56,7 +58,7 @@ def save_hugging_face(kind: str, folder: Path) -> torch.nn.Module:
         ends = {"bos_token_id": 52, "eos_token_id": 53, "pad_token_id": 53, "projection_size": 32}
         model = transformers.SiglipModel(transformers.SiglipConfig(text_config=TEXT | ends, vision_config=VISION))
         transformers.SiglipImageProcessor(size=PROCESSOR["size"]).save_pretrained(folder)
-        save_clip_tokenizer(folder)
+        save_clip_tokenizer(folder, model_input_names=["input_ids"])  # as SigLIP's own: it attends to the padding
     model.eval().save_pretrained(folder)
     return model
 
@@ -76,6 +78,13 @@ def test_transformers_embeds_images_as_the_library_does(
     assert load_embedder(f"transformers:{tmp_path}", precision="fp32").fingerprint == embedder.fingerprint
 
 
+def test_a_folder_without_a_tokenizer_is_told_so(tmp_path: Path) -> None:
+    save_hugging_face("clip", tmp_path)
+    (tmp_path / "tokenizer_config.json").unlink()
+    with pytest.raises(BadInput, match=r"tokenizer_config\.json is not a file"):
+        load_embedder(f"transformers:{tmp_path}").embed_texts(SENTENCES)
+
+
 @pytest.mark.parametrize(("kind", "padding"), [("clip", True), ("siglip", "max_length")])
 def test_transformers_embeds_sentences_as_the_library_does(kind: str, padding: bool | str, tmp_path: Path) -> None:
     model = save_hugging_face(kind, tmp_path)
@@ -89,6 +98,21 @@ def test_transformers_embeds_sentences_as_the_library_does(kind: str, padding: b
     assert not np.allclose(vectors[0], vectors[1])
 
 
+def test_a_vision_transformer_without_weights_for_its_pooling_gives_its_class_token(
+    tmp_path: Path, frames: list[np.ndarray]
+) -> None:
+    torch.manual_seed(0)
+    model = transformers.ViTModel(transformers.ViTConfig(**VISION), add_pooling_layer=False).eval()
+    model.save_pretrained(tmp_path)
+    transformers.ViTImageProcessor(size=PROCESSOR["size"]).save_pretrained(tmp_path)
+    processor = transformers.AutoImageProcessor.from_pretrained(tmp_path)
+    pixels = processor(images=[Image.fromarray(frame) for frame in frames], return_tensors="pt")
+    with torch.inference_mode():
+        expected = model(**pixels).last_hidden_state[:, 0].numpy()
+    vectors = load_embedder(f"transformers:{tmp_path}", precision="fp32").embed_images(frames)
+    np.testing.assert_allclose(vectors, expected, atol=1e-4)
+
+
 def test_transformers_weights_that_are_not_all_there_are_refused(tmp_path: Path) -> None:
     """Transformers itself fills them with random numbers and only logs it."""
     save_hugging_face("clip", tmp_path)
@@ -97,6 +121,8 @@ def test_transformers_weights_that_are_not_all_there_are_refused(tmp_path: Path)
     save_file(state, tmp_path / "model.safetensors", metadata={"format": "pt"})
     with pytest.raises(BadInput, match=r"1 missing \(visual_projection.weight\)"):
         load_embedder(f"transformers:{tmp_path}")
+    with pytest.raises(BadInput, match="nowhere is not a folder"):
+        load_embedder(f"transformers:{tmp_path}/nowhere")
     (tmp_path / "config.json").unlink()
     with pytest.raises(BadInput, match=r"config\.json is not a file"):
         load_embedder(f"transformers:{tmp_path}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,12 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.conftest import COLLECTED
-from zest_rl import data, metrics, quality
+from tests.conftest import COLLECTED, collect_some
+from zest_rl import data, metrics, quality, rendering
 from zest_rl.errors import BadInput
 from zest_rl.frames import Views
-from zest_rl.inspection import FIGURES, confusion, confusion_warnings, inspect, inspection_report, warnings
+from zest_rl.inspection import FIGURES, Inspection, inspect, warnings
+from zest_rl.inspection_page import confusion, confusion_warnings, inspection_report, labels
 from zest_rl.metrics import Estimate
 from zest_rl.relabel import relabel
 from zest_rl.report import render_html
@@ -45,7 +45,7 @@ def test_figures_are_those_of_the_recorded_scores_and_ground_truth(scored: str) 
     assert found.figures["Spearman ρ"] == metrics.spearman(returns, truth)
     assert found.figures["Pairwise accuracy"] == quality.pairwise_accuracy(returns, truth)
     assert found.figures["Contradictory"].value == 0
-    assert (found.label, found.has_truth) == ("micro by same-scene", True)
+    assert (found.task, found.has_truth) == ("micro", True)
     scores, success = data.read_scores(scored), [episode.success for episode in data.read_ground_truth(scored)]
     for name, wanted in (("successes", True), ("failures", False)):
         group = [score[1:] for score, won in zip(scores, success, strict=True) if won == wanted]
@@ -57,9 +57,10 @@ def test_figures_are_those_of_the_recorded_scores_and_ground_truth(scored: str) 
 def test_scores_of_other_episodes_are_found_out_without_ground_truth(collected: str) -> None:
     shuffled = relabel(collected, CONFIG, shuffle=0, n_workers=1).dataset_id
     found = inspect(shuffled)
-    assert found.label == "micro by same-scene, shuffled"
     assert found.figures["Contradictory"].value > 0.01
-    assert any("not of these episodes (shuffled?)" in warning for warning in found.warnings)
+    told, seen = (warning for warning in found.warnings if "shuffle" in warning)
+    assert "relabeled with --shuffle" in told
+    assert "not of these episodes (shuffled?)" in seen
 
 
 def test_without_ground_truth_the_rest_is_still_measured(scored: str) -> None:
@@ -118,23 +119,77 @@ def test_constant_scores_and_constant_returns_are_warned_of() -> None:
     assert "same return" in warnings(alike, figures)[0]
 
 
-def test_a_goal_that_prefers_another_task_is_named(
-    collected: str, scored: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    wrong = relabel(collected, replace(CONFIG, goal="drawings"), n_workers=1).dataset_id
+def test_differences_are_judged_as_the_trainer_sees_them(collected: str, scored: str) -> None:
+    differences = relabel(collected, CONFIG, reward="difference", n_workers=1).dataset_id
+    found, level = inspect(differences), inspect(scored)
+    last = np.array([score[-1] - score[0] for score in data.read_scores(differences)])
+    truth = np.array([episode.episode_return for episode in data.read_ground_truth(differences)])
+    assert found.figures["Spearman ρ"].value == pytest.approx(metrics.spearman(last, truth).value)
+    assert found.figures["Contradictory"].value == 0, "levels repeat where states do, differences need not"
+    assert found.figures["Value-order correlation"] != level.figures["Value-order correlation"]
+    assert labels([found, level]) == ["micro by same-scene, reward difference", "micro by same-scene, reward level"]
+
+
+def test_labels_tell_what_differs() -> None:
+    def made(**changes: Any) -> dict[str, Any]:
+        config = {"goal": "same-scene", "embedder": "e", "features": "delta", "similarity": "cos", "goal_share": 1.0}
+        views = {"n_views": changes.pop("n_views", 8)}
+        reward, shuffle = changes.pop("reward", "level"), changes.pop("shuffle", None)
+        return {"scorer": {"config": {**config, "views": views, **changes}}, "reward": reward, "shuffle": shuffle}
+
+    def named(*all_made: dict[str, Any]) -> list[str]:
+        return labels([Inspection(f"zest/{i}", "micro", one, {}, (), {}, False) for i, one in enumerate(all_made)])
+
+    assert named(made()) == ["micro by same-scene"]
+    assert named(made(), made(goal="/a/b/drawn")) == ["micro by same-scene", "micro by drawn"]
+    assert named(made(), made(features="raw", n_views=1)) == [
+        "micro by same-scene, features delta, views 8",
+        "micro by same-scene, features raw, views 1",
+    ]
+    assert named(made(), made(shuffle=3)) == ["micro by same-scene, shuffled no", "micro by same-scene, shuffled 3"]
+    assert named(made(), made()) == ["micro by same-scene (zest/0)", "micro by same-scene (zest/1)"]
+
+
+@pytest.fixture
+def of_two_tasks(collected: str, zest: Callable[..., dict[str, Any]]) -> tuple[str, str]:
+    """The tiny microwave dataset and one of the sliding door, each with scores of its own scene."""
+    other = "zest/kitchen-sdoor-tiny-v0"
+    collect_some(other, "sdoor", 3)
+    small = ("--views", 1, "--tolerance", 0.05, "--n-workers", 1)
+    return zest("relabel", collected, *small)["dataset"], zest("relabel", other, *small)["dataset"]
+
+
+def test_each_goal_scores_the_ends_of_all_tasks_as_their_own_views_show_them(of_two_tasks: tuple[str, str]) -> None:
+    inspections = [inspect(dataset) for dataset in of_two_tasks]
     done: list[None] = []
-    means = confusion((scored, wrong), on_done=lambda: done.append(None))
+    means = confusion(inspections, n_workers=1, on_done=lambda: done.append(None))
     assert len(done) == 2
-    assert means.shape == (2, 2)
-    ends = [np.mean([score[-1] for score in data.read_scores(dataset)]) for dataset in (scored, wrong)]
-    np.testing.assert_allclose(means, np.tile(ends, (2, 1)), rtol=1e-4)  # both datasets hold the same episodes
-    preferring = np.array([[0.1, 0.9], [0.4, 0.3]], np.float32)
-    assert confusion_warnings((scored, wrong), preferring) == {}, "two goals of one task are no rivals"
-    monkeypatch.setattr(data, "task_name", {scored: "micro", wrong: "sdoor"}.__getitem__)
-    found = confusion_warnings((scored, wrong), preferring)
-    assert set(found) == {scored, wrong}
-    assert f"episodes of {wrong} higher (0.40) than its own (0.10)" in found[scored]
-    assert confusion_warnings((scored, wrong), np.eye(2, dtype=np.float32)) == {}
+    for i, dataset in enumerate(of_two_tasks):
+        own = np.mean([score[-1] for score in data.read_scores(dataset)])
+        assert means[i, i] == pytest.approx(own, abs=1e-5)
+        assert means[i, i] > means[1 - i, i], "an open door looks more like itself than like another one"
+        assert means[1 - i, i] != 0, "something is seen to change"
+    assert confusion_warnings(inspections, means) == {}
+    found = confusion_warnings(inspections, means[::-1])
+    assert set(found) == set(of_two_tasks)
+    assert "the episodes of sdoor higher" in found[of_two_tasks[0]]
+
+
+def test_the_page_shows_tasks_against_goals_and_does_without_where_scorers_are_of_another_version(
+    of_two_tasks: tuple[str, str],
+    tmp_path: Path,
+    zest: Callable[..., dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    words = ("inspect", *of_two_tasks, "--output", tmp_path / "page.html", "--n-workers", 1)
+    matrix = zest(*words)["goals_against_tasks"]
+    assert np.shape(matrix) == (2, 2)
+    page = (tmp_path / "page.html").read_text()
+    assert "<h2>Tasks against goals</h2>" in page
+    assert f"<b>{matrix[1][1]:.2f}</b>" in page
+    monkeypatch.setattr(rendering, "_RENDERER_VERSION", -1)
+    assert zest(*words)["goals_against_tasks"] is None
+    assert "<h2>Reward quality</h2>" in (tmp_path / "page.html").read_text()
 
 
 def test_the_verb_prints_figures_warns_and_leaves_a_page(

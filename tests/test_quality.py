@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -29,18 +28,20 @@ def equal(got: float, expected: float) -> bool:
     return math.isclose(got, expected, abs_tol=1e-9) or (math.isnan(got) and math.isnan(expected))
 
 
-@pytest.fixture(scope="module")
-def quick() -> Iterator[None]:
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two bootstrap samples: the values do not depend on them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(quality, "over_episodes", partial(quality.over_episodes, n_resamples=2))
-        yield
+    monkeypatch.setattr(quality, "over_episodes", partial(quality.over_episodes, n_resamples=2))
+
+
+one_patch_for_all_examples = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 # --- against naive loops ---
 
 
 @pytest.mark.usefixtures("quick")
+@one_patch_for_all_examples
 @given(small, st.data())
 def test_pairwise_accuracy_equals_a_loop_over_pairs(returns: list[int], draw: st.DataObject) -> None:
     truth = draw.draw(st.lists(st.integers(0, 3), min_size=len(returns), max_size=len(returns)))
@@ -56,6 +57,7 @@ def test_pairwise_accuracy_equals_a_loop_over_pairs(returns: list[int], draw: st
 
 
 @pytest.mark.usefixtures("quick")
+@one_patch_for_all_examples
 @given(small, st.data())
 def test_average_precision_equals_a_loop_over_thresholds(returns: list[int], draw: st.DataObject) -> None:
     success = draw.draw(st.lists(st.booleans(), min_size=len(returns), max_size=len(returns)))
@@ -69,6 +71,7 @@ def test_average_precision_equals_a_loop_over_thresholds(returns: list[int], dra
 
 
 @pytest.mark.usefixtures("quick")
+@one_patch_for_all_examples
 @given(st.integers(0, 100))
 def test_epic_distance_is_that_of_pearson_s_correlation_over_all_transitions(seed: int) -> None:
     a, b = noise(seed), noise(seed + 1)
@@ -77,16 +80,24 @@ def test_epic_distance_is_that_of_pearson_s_correlation_over_all_transitions(see
 
 
 @pytest.mark.usefixtures("quick")
+@one_patch_for_all_examples
 @given(st.integers(0, 100))
-def test_the_share_told_by_the_step_is_the_variance_between_steps_over_all(seed: int) -> None:
-    scores = [score[: 5 + i] for i, score in enumerate(noise(seed))]  # of different lengths
-    every = np.concatenate(scores)
-    mean = [np.mean([score[t] for score in scores if len(score) > t]) for t in range(max(map(len, scores)))]
-    told = np.concatenate([mean[: len(score)] for score in scores])
-    assert quality.share_told_by_step(scores).value == pytest.approx(told.var() / every.var(), abs=1e-5)
+def test_the_share_told_by_the_step_equals_a_loop_over_the_other_episodes(seed: int) -> None:
+    scores = [score[: 5 + i] + 0.3 * RISING[: 5 + i] for i, score in enumerate(noise(seed))]  # of different lengths
+    error = distance = 0.0
+    for i, score in enumerate(scores):
+        others = scores[:i] + scores[i + 1 :]
+        overall = np.mean(np.concatenate(others))
+        for t, value in enumerate(score):
+            at_step = [other[t] for other in others if len(other) > t]
+            if at_step:
+                error += (value - np.mean(at_step)) ** 2
+                distance += (value - overall) ** 2
+    assert quality.share_told_by_step(scores).value == pytest.approx(max(0, 1 - error / distance), abs=1e-5)
 
 
 @pytest.mark.usefixtures("quick")
+@one_patch_for_all_examples
 @given(st.integers(0, 100))
 def test_kendall_and_value_order_are_scipy_s(seed: int) -> None:
     a, b = np.random.default_rng(seed).normal(size=(2, N))
@@ -124,9 +135,9 @@ def test_a_clock_is_told_by_the_step_and_noise_is_not() -> None:
     assert quality.value_order([np.zeros(T, np.float32)] * N).value == 0
 
 
-def test_saturation_counts_the_fuller_end() -> None:
+def test_saturation_counts_both_ends() -> None:
     score = np.array([0, 1, 1, 1, 0.5, 1, 1, 1, 1, 0.97], np.float32)
-    assert quality.share_saturated([score] * 3).value == pytest.approx(0.8)
+    assert quality.share_saturated([score] * 3).value == pytest.approx(0.9)
 
 
 def test_frames_equal_to_the_first_show_nothing() -> None:
@@ -149,9 +160,37 @@ def test_an_undefined_figure_is_nan_and_not_a_number_that_looks_good() -> None:
         assert math.isnan(estimate.low)
 
 
-def test_intervals_hold_the_value_and_narrow_with_more_episodes() -> None:
+def test_every_interval_holds_its_value() -> None:
+    for seed in range(5):
+        scores, truth = noise(seed), noise(seed + 10)
+        mixed = [0.5 * a + b for a, b in zip(scores, truth, strict=True)]
+        returns, true_returns = quality.returns_of(mixed), quality.returns_of(truth)
+        states = [np.round(score)[:, None] for score in scores]
+        for estimate in (
+            quality.value_order(mixed),
+            quality.share_told_by_step(mixed),
+            quality.share_told_by_step([score + 0.1 * RISING for score in mixed]),
+            quality.share_saturated(mixed),
+            quality.share_still(states),
+            quality.share_contradictory(mixed, states),
+            quality.kendall(returns, true_returns),
+            quality.pairwise_accuracy(returns, true_returns),
+            quality.average_precision(returns, true_returns > 0),
+            quality.epic_distance(mixed, truth),
+        ):
+            assert estimate.low <= estimate.value <= estimate.high
+
+
+def test_epic_distance_does_not_depend_on_scale_or_offset() -> None:
+    scores, truth = noise(0), noise(1)
+    expected = quality.epic_distance(scores, truth).value
+    for scale, offset in ((1e-9, 0), (1e6, 0), (1, 300)):
+        scaled = [(scale * episode.astype(np.float64) + offset).astype(np.float64) for episode in truth]
+        assert quality.epic_distance(scores, scaled).value == pytest.approx(expected, abs=1e-6)
+
+
+def test_intervals_narrow_with_more_episodes() -> None:
     few, many = (quality.value_order([RISING + 8 * e for e in noise(0, n=n)]) for n in (10, 200))
-    assert few.low <= few.value <= few.high
     assert many.high - many.low < few.high - few.low
 
 

@@ -17,9 +17,12 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from zest_rl.errors import BadInput
 from zest_rl.report import Curve, EpisodePanel, GoalPanel, MethodRow, Report, Scatter, render_html, write_report
+from zest_rl.report.charts import axis_over
 
 N_STEPS = 30
 FPS = 10.0
@@ -149,6 +152,15 @@ def test_figures_that_are_not_finite_are_shown_as_a_dash(report: Report) -> None
     assert "1 episode, 2 without a finite return not shown" in html
     values = [json.loads(data) for data in re.findall(r'data-values="([^"]*)"', html)]
     assert values[0] == [0.5 if 3 <= step < 9 else None for step in range(N_STEPS + 1)]
+
+
+@given(st.floats(-1e4, 1e4), st.floats(1e-6, 1e4), st.integers(2, 8), st.sampled_from([0.0, 0.02, 0.05]))
+def test_an_axis_has_at_least_two_ticks_and_all_lie_on_it(low: float, size: float, n: int, margin: float) -> None:
+    axis = axis_over([low, low + size], n, margin)
+    assert 2 <= len(axis.ticks) <= 2.5 * n + 2
+    slack = 1e-6 * (axis.high - axis.low)
+    assert all(axis.low - slack <= tick <= axis.high + slack for tick in axis.ticks)
+    assert len({axis.label(tick) for tick in axis.ticks}) == len(axis.ticks)
 
 
 def test_the_page_depends_on_the_report_alone(report: Report) -> None:

@@ -17,6 +17,7 @@ from zest_rl.selection import (
     over_trajectories,
     relative_variation,
     top_n_success,
+    top_up_to,
 )
 
 
@@ -90,6 +91,18 @@ def test_whole_trajectories_are_resampled_and_repeats_averaged() -> None:
     )
     assert by_frame.value == found.value
     assert ratio.high - ratio.low > 2 * (ratio_by_frame.high - ratio_by_frame.low)
+
+
+def test_resamples_with_few_satisfied_goals_are_kept() -> None:
+    rng = np.random.default_rng(0)
+    trajectory = np.repeat(np.arange(12), 4)
+    satisfies = trajectory < 6
+    scores = rng.normal(size=(1, len(trajectory))) + satisfies
+    n = int(satisfies.sum())
+    found = over_trajectories(partial(top_up_to, n=n), scores, satisfies, trajectory, n_resamples=300)
+    strict = over_trajectories(partial(top_n_success, n=n), scores, satisfies, trajectory, n_resamples=300)
+    assert found.value == strict.value == top_n_success(scores[0], satisfies, n)
+    assert found.low < strict.low, "resamples with fewer satisfied goals are the unlucky ones"
 
 
 def test_more_places_than_the_goal_can_fill_are_refused() -> None:

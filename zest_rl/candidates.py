@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from zest_rl import data
 from zest_rl.envs import progress_of
 from zest_rl.errors import BadInput, nearest
+from zest_rl.frames import Views, canonical_states
 from zest_rl.scorer import Scorer, ScorerConfig
 from zest_rl.tasks import SUCCESS_PROGRESS, TASKS, Task, get_task
 
@@ -44,6 +45,10 @@ class Candidates:
             done |= of_other & self.satisfies(TASKS[other])
         return done
 
+    def start_alike(self, views: Views) -> bool:
+        """Whether all trajectories start with the same picture, as without the robot in view."""
+        return len(np.unique(canonical_states(self.starts, views), axis=0)) == 1
+
     def contexts(self, context: Context, seed: int) -> NDArray[np.float64]:
         """Draw x_0 of each candidate: (M, nq).
 
@@ -72,8 +77,11 @@ def draw_candidates(dataset_ids: Sequence[str], n_frames: int, seed: int = 0) ->
     Raises:
         BadInput: no dataset, none of that name, or `n_frames` is below 1.
     """
-    if not dataset_ids or n_frames < 1:
-        raise BadInput(f"candidates need at least 1 dataset and 1 frame of each, got {len(dataset_ids)} and {n_frames}")
+    if not dataset_ids or n_frames < 1 or len(set(dataset_ids)) < len(dataset_ids):
+        raise BadInput(
+            "candidates need at least 1 dataset, each once, and 1 frame of each, got "
+            f"{', '.join(dataset_ids) or 'none'} and {n_frames}"
+        )
     rng = np.random.default_rng(seed)
     states: list[NDArray[np.float64]] = []
     starts: list[NDArray[np.float64]] = []
@@ -92,7 +100,7 @@ def draw_candidates(dataset_ids: Sequence[str], n_frames: int, seed: int = 0) ->
     return Candidates(np.stack(states), np.array(trajectory, dtype=np.intp), tuple(tasks), np.stack(starts))
 
 
-def sampled(scorer: Scorer, n_goals: int | None, seed: int) -> None:
+def draw_goals(scorer: Scorer, n_goals: int | None, seed: int) -> None:
     """Keep `n_goals` of a scorer's goals, drawn with `seed`; None keeps all.
 
     Raises:
@@ -133,7 +141,7 @@ def score_as_goals(
     rows = []
     for repeat in range(n_repeats):
         scorer = Scorer.build(config, candidates.starts[0], n_workers=n_workers)
-        sampled(scorer, n_goals, repeat)
+        draw_goals(scorer, n_goals, repeat)
         rows.append(scorer.score_pairs(candidates.contexts(context, repeat), candidates.states, on_progress))
     return np.stack(rows).astype(np.float64)
 
@@ -165,7 +173,7 @@ def score_as_actions(
     scores = np.empty((n_repeats, len(candidates.states)))
     for repeat in range(n_repeats):
         own = Scorer.build(config, candidates.starts[0], n_workers=n_workers)
-        sampled(own, n_goals, repeat)
+        draw_goals(own, n_goals, repeat)
         for name in sorted(set(candidates.task)):
             seen = replace(config, views=replace(config.views, task=get_task(name).name))
             scorer = Scorer(seen, own.starts, own.goals, own.goal_fingerprint, n_workers=n_workers)

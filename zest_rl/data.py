@@ -194,6 +194,11 @@ def read_states(dataset_id: str) -> list[NDArray[np.float64]]:
     return _each(dataset_id, read)
 
 
+def has_ground_truth(dataset_id: str) -> bool:
+    """Whether any episode holds the hand-designed rewards; `read_ground_truth` refuses a dataset where some do not."""
+    return any(_each(dataset_id, lambda group: "infos/gt" in group))
+
+
 def read_ground_truth(dataset_id: str) -> list[GroundTruth]:
     """Read the hand-designed rewards of every episode: for evaluation and reports only, never for a trainer.
 
@@ -264,7 +269,7 @@ def task_name(dataset_id: str) -> str:
     name = spec.get("kwargs", {}).get("task")
     if name is None or not str(spec.get("entry_point")).startswith("zest_rl."):
         raise BadInput(
-            f"dataset {dataset_id} is of environment {spec.get('id')!r}; frames can be rendered for zest/Kitchen-v0 "
+            f"dataset {dataset_id} is of environment {spec.get('id')!r}; frames can be rendered for zest/Kitchen-v1 "
             "only, so collect a dataset with `zest collect`"
         )
     return str(name)

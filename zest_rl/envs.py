@@ -10,7 +10,8 @@ package. What differs, and why:
   a change that every later frame would show and that is not the robot's doing;
 - the reward is the progress of one joint, so that it is a level like the ZeST scores; nothing ends an episode early.
 
-Importing this module registers ``zest/Kitchen-v0``.
+Importing this module registers ``zest/Kitchen-v1``; its number rises with every change of what an action does or where
+an episode starts, so that neither data nor policies of an earlier one are taken for its own.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from zest_rl.types import FloatArray
 with redirect_stderr(StringIO()):  # on import it prints news of its other environments
     from gymnasium_robotics.envs.franka_kitchen import KitchenEnv as FrankaKitchen
 
-ENV_ID = "zest/Kitchen-v0"
+ENV_ID = "zest/Kitchen-v1"
 HORIZON = 100
 """Steps per episode (8 s); the same for every task, so that a sum of levels does not reward length."""
 ACT_DIM = 9

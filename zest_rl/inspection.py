@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +12,7 @@ from numpy.typing import NDArray
 from zest_rl import data, metrics, quality
 from zest_rl.errors import BadInput
 from zest_rl.frames import Views, canonical_states
-from zest_rl.goals import VISUAL_TASKS
 from zest_rl.metrics import Estimate
-from zest_rl.panels import goal_panel, goal_scatter
-from zest_rl.relabel import SCORER_FILE
-from zest_rl.report import Curve, Matrix, QualityRow, QualityTable, Report
-from zest_rl.scorer import Scorer
 from zest_rl.types import FloatArray, GroundTruth
 
 CLOCK, SATURATED, STILL, CONTRADICTORY = 0.95, 0.95, 0.9, 0.01
@@ -40,15 +34,17 @@ class Figure:
 class _Rewards:
     """What is known of the rewards of one dataset."""
 
+    rewards: list[FloatArray]
+    """(T,) per episode, as a trainer sees them."""
     scores: list[FloatArray]
-    """(T,) per episode, of the frames after each action."""
+    """(T,) per episode, of the frames after each action; the rewards, unless these are differences."""
     states: list[NDArray[np.float64]]
     """(T+1, nq) per episode, rounded as the frames were rendered."""
     truth: list[GroundTruth] | None
     returns: NDArray[np.float64] = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "returns", quality.returns_of(self.scores))
+        object.__setattr__(self, "returns", quality.returns_of(self.rewards))
 
     @property
     def true_returns(self) -> NDArray[np.float64]:
@@ -97,25 +93,25 @@ FIGURES = (
         "EPIC distance",
         "to the true reward, step by step; 0 is the same up to scale and offset, .71 unrelated",
         True,
-        lambda r: quality.epic_distance(r.scores, [e.rewards for e in r.known_truth]),
+        lambda r: quality.epic_distance(r.rewards, [e.rewards for e in r.known_truth]),
     ),
     Figure(
         "Value-order correlation",
-        "of score and time within an episode; 1 is a score that never falls",
+        "of reward and time within an episode; 1 rises at every step",
         False,
-        lambda r: quality.value_order(r.scores),
+        lambda r: quality.value_order(r.rewards),
     ),
     Figure(
         "Told by the step",
-        "share of the scores' variance that the number of the step explains; 1 is a clock",
+        "share of the rewards' variance that the number of the step tells; 1 is a clock",
         False,
-        lambda r: quality.share_told_by_step(r.scores),
+        lambda r: quality.share_told_by_step(r.rewards),
     ),
     Figure(
         "Saturated",
-        "share of frames that score next to the lowest or the highest",
+        "share of rewards next to the lowest or the highest",
         False,
-        lambda r: quality.share_saturated(r.scores),
+        lambda r: quality.share_saturated(r.rewards),
     ),
     Figure(
         "Nothing to see",
@@ -137,18 +133,19 @@ class Inspection:
     """What can be said of one dataset's rewards."""
 
     dataset_id: str
-    label: str
-    """Task and goal, for people: ``sdoor by real_imgs``."""
+    task: str
+    made: Mapping[str, Any]
+    """How it was relabeled, as `zest_rl.relabel` left it."""
     figures: Mapping[str, Estimate]
     """By the names of `FIGURES`; those that need ground truth are missing where there is none."""
     warnings: tuple[str, ...]
     over_time: Mapping[str, FloatArray]
-    """Mean score at each step (T,), of successes and failures; without ground truth, of all episodes."""
+    """Mean reward at each step (T,), of successes and failures; without ground truth, of all episodes."""
     has_truth: bool
 
     def known_figures(self) -> dict[str, Estimate | None]:
         """Every figure that was measured, by name; None where it is undefined, as for constant scores."""
-        return {name: None if math.isnan(one.value) else one for name, one in self.figures.items()}
+        return {name: None if np.isnan(one.value) else one for name, one in self.figures.items()}
 
 
 def inspect(dataset_id: str) -> Inspection:
@@ -162,46 +159,41 @@ def inspect(dataset_id: str) -> Inspection:
         raise BadInput(f"dataset {dataset_id} holds no ZeST scores; run `zest relabel {dataset_id}` and inspect that")
     scorer = made["scorer"]["config"]
     views = Views(**scorer["views"])
-    label = f"{views.task} by {Path(scorer['goal']).name.removeprefix(VISUAL_TASKS)}"
-    scores = [score[1:] for score in data.read_scores(dataset_id)]
-    if len(scores) < MIN_EPISODES:
-        raise BadInput(f"rewards can be judged on at least {MIN_EPISODES} episodes, {dataset_id} has {len(scores)}")
+    step_rewards = [episode.rewards for episode in data.read_episodes(dataset_id)]
+    if len(step_rewards) < MIN_EPISODES:
+        raise BadInput(
+            f"rewards can be judged on at least {MIN_EPISODES} episodes, {dataset_id} has {len(step_rewards)}"
+        )
     rewards = _Rewards(
-        scores, [canonical_states(states, views) for states in data.read_states(dataset_id)], _truth(dataset_id)
+        step_rewards,
+        [score[1:] for score in data.read_scores(dataset_id)],
+        [canonical_states(states, views) for states in data.read_states(dataset_id)],
+        data.read_ground_truth(dataset_id) if data.has_ground_truth(dataset_id) else None,
     )
     figures = {
         figure.name: figure.measure(rewards)
         for figure in FIGURES
         if rewards.truth is not None or not figure.needs_truth
     }
+    found = warnings(step_rewards, figures)
+    if made["shuffle"] is not None:
+        found.insert(0, "These are the scores of other episodes: the dataset was relabeled with --shuffle.")
     return Inspection(
-        dataset_id,
-        label if made["shuffle"] is None else f"{label}, shuffled",
-        figures,
-        tuple(warnings(scores, figures)),
-        _over_time(rewards),
-        rewards.truth is not None,
+        dataset_id, views.task, made, figures, tuple(found), _over_time(rewards), rewards.truth is not None
     )
 
 
-def _truth(dataset_id: str) -> list[GroundTruth] | None:
-    try:
-        return data.read_ground_truth(dataset_id)
-    except BadInput:
-        return None
-
-
-def warnings(scores: Sequence[FloatArray], figures: Mapping[str, Estimate]) -> list[str]:
+def warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimate]) -> list[str]:
     """What speaks against training on these rewards: sentences, none when nothing does.
 
     Args:
-        scores: (T,) per episode.
+        rewards: (T,) per episode.
         figures: by the names of `FIGURES`.
     """
-    if np.ptp(np.concatenate(scores)) == 0:
+    if np.ptp(np.concatenate(rewards)) == 0:
         return ["All frames score the same: this goal and embedder tell nothing apart. Look at the goal's pictures."]
     found = []
-    if np.ptp(quality.returns_of(scores)) == 0:
+    if np.ptp(quality.returns_of(rewards)) == 0:
         found.append("All episodes have the same return: there is nothing to condition a Decision Transformer on.")
     if figures["Contradictory"].value >= CONTRADICTORY:
         found.append(
@@ -225,13 +217,13 @@ def warnings(scores: Sequence[FloatArray], figures: Mapping[str, Estimate]) -> l
 
 
 def _over_time(rewards: _Rewards) -> dict[str, FloatArray]:
-    groups = {"all episodes": list(range(len(rewards.scores)))}
+    groups = {"all episodes": list(range(len(rewards.rewards)))}
     if rewards.truth is not None:
         success = [episode.success for episode in rewards.truth]
         groups = {"successes": [], "failures": []}
         for i, won in enumerate(success):
             groups["successes" if won else "failures"].append(i)
-    return {name: _mean_by_step([rewards.scores[i] for i in group]) for name, group in groups.items() if group}
+    return {name: _mean_by_step([rewards.rewards[i] for i in group]) for name, group in groups.items() if group}
 
 
 def _mean_by_step(scores: Sequence[FloatArray]) -> FloatArray:
@@ -241,86 +233,3 @@ def _mean_by_step(scores: Sequence[FloatArray]) -> FloatArray:
         total[: len(score)] += score
         count[: len(score)] += 1
     return np.asarray(total / count, dtype=np.float32)
-
-
-def confusion(dataset_ids: Sequence[str], on_done: Callable[[], object] = lambda: None) -> FloatArray:
-    """Score where each dataset's episodes end by the goal of each: (n, n) float32, rows are datasets, columns goals.
-
-    A goal that is worth something scores the episodes of its own task highest. Needs no ground truth.
-
-    Args:
-        dataset_ids: relabeled datasets, best one per task.
-        on_done: called after each goal.
-    """
-    ends = [[episode[[0, -1]] for episode in data.read_states(dataset_id)] for dataset_id in dataset_ids]
-    means = np.empty((len(dataset_ids), len(dataset_ids)), dtype=np.float32)
-    for column, goal_of in enumerate(dataset_ids):
-        scorer = Scorer.load(data.dataset_path(goal_of) / SCORER_FILE)
-        for row, episodes in enumerate(ends):
-            means[row, column] = np.mean([score[-1] for score in scorer.score_episodes(episodes)[0]])
-        on_done()
-    return means
-
-
-def confusion_warnings(dataset_ids: Sequence[str], means: FloatArray) -> dict[str, str]:
-    """Find the goals that score the episodes of another task higher than those of their own: dataset → sentence."""
-    tasks = [data.task_name(dataset_id) for dataset_id in dataset_ids]
-    found = {}
-    for column, goal_of in enumerate(dataset_ids):
-        best = int(np.argmax(means[:, column]))
-        if tasks[best] != tasks[column]:
-            found[goal_of] = (
-                f"Its goal scores the episodes of {dataset_ids[best]} higher ({means[best, column]:.2f}) than its own "
-                f"({means[column, column]:.2f})."
-            )
-    return found
-
-
-def inspection_report(
-    inspections: Sequence[Inspection], means: FloatArray | None, warnings: Mapping[str, Sequence[str]]
-) -> Report:
-    """Build the page.
-
-    Args:
-        inspections: one per dataset.
-        means: of `confusion`.
-        warnings: by dataset.
-    """
-    names = tuple(_unique([(one.label, one.dataset_id) for one in inspections]))
-    judged = [one.known_figures() for one in inspections]
-    rows = [
-        QualityRow(figure.name, figure.meaning, tuple(_interval(known.get(figure.name)) for known in judged))
-        for figure in FIGURES
-    ]
-    scatters = {
-        one.dataset_id: goal_scatter(name, one.dataset_id)
-        for name, one in zip(names, inspections, strict=True)
-        if one.has_truth
-    }
-    curves = [
-        Curve(group, f"{name}: mean score", np.arange(1, len(mean) + 1, dtype=np.float32), mean)
-        for name, one in zip(names, inspections, strict=True)
-        for group, mean in one.over_time.items()
-    ]
-    n_warnings = sum(map(len, warnings.values()))
-    return Report(
-        title="What these rewards are worth",
-        summary_sentence=f"{len(names)} datasets, {n_warnings} warnings. Nothing was trained.",
-        warnings=tuple(f"{dataset}: {sentence}" for dataset, found in warnings.items() for sentence in found),
-        quality=QualityTable(names, tuple(rows)),
-        matrix=None if means is None else Matrix(names, means),
-        goals=tuple(goal_panel(scatter.name, dataset_id, scatter) for dataset_id, scatter in scatters.items()),
-        scatters=tuple(scatters.values()),
-        details={name: {"dataset": one.dataset_id} for name, one in zip(names, inspections, strict=True)},
-        scores_over_time=tuple(curves),
-    )
-
-
-def _unique(labelled: Sequence[tuple[str, str]]) -> list[str]:
-    """Return the labels of (label, dataset), with the dataset where a label is there twice."""
-    labels = [label for label, _ in labelled]
-    return [f"{label} ({dataset_id})" if labels.count(label) > 1 else label for label, dataset_id in labelled]
-
-
-def _interval(estimate: Estimate | None) -> tuple[float, float, float] | None:
-    return None if estimate is None else (estimate.value, estimate.low, estimate.high)

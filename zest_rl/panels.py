@@ -24,24 +24,27 @@ MIN_EPISODES_TO_RANK = 3
 
 
 def goal_scatter(name: str, dataset_id: str) -> Scatter:
-    """ZeST return against ground-truth return of a relabeled dataset's episodes."""
-    zest = np.array([score[1:].sum() for score in data.read_scores(dataset_id)], dtype=np.float32)
-    truth = np.array([e.episode_return for e in data.read_ground_truth(dataset_id)], dtype=np.float32)
+    """Return by a relabeled dataset's rewards against its ground-truth return, per episode."""
+    zest = np.array([episode.rewards.sum(dtype=np.float64) for episode in data.read_episodes(dataset_id)])
+    truth = np.array([episode.episode_return for episode in data.read_ground_truth(dataset_id)])
     rho = metrics.Estimate(math.nan, math.nan, math.nan)
     if len(zest) >= MIN_EPISODES_TO_RANK:
-        rho = metrics.spearman(zest.astype(np.float64), truth.astype(np.float64))
-    return Scatter(name, zest, truth, rho.value, (rho.low, rho.high))
+        rho = metrics.spearman(zest, truth)
+    return Scatter(name, zest.astype(np.float32), truth.astype(np.float32), rho.value, (rho.low, rho.high))
 
 
-def goal_panel(name: str, dataset_id: str, scatter: Scatter) -> GoalPanel:
-    """The goal of a relabeled dataset, as pictures or sentences."""
-    config = data.describe(dataset_id)["zest"]["relabel"]["scorer"]["config"]
+def goal_panel(name: str, dataset_id: str, scatter: Scatter | None = None) -> GoalPanel:
+    """The goal of a relabeled dataset, as pictures or sentences; how it ranks episodes, where that is known."""
+    made = data.read_metadata(dataset_id)["zest"]["relabel"]
+    config = made["scorer"]["config"]
+    ranking = (None, 0) if scatter is None else (scatter.spearman, len(scatter.gt_returns))
     folder = data.dataset_path(dataset_id) / GOAL_FOLDER
     if folder.is_dir():
         start, goal = (tuple(read_image(path) for path in list_images(folder / part)) for part in ("init", "goal"))
-        return GoalPanel(name, start, goal, scatter.spearman, len(scatter.gt_returns))
+        return GoalPanel(name, start, goal, *ranking)
     sentences = read_goal(config["goal"], get_task(config["views"]["task"]))
-    return GoalPanel(name, sentences.starts, sentences.goals, scatter.spearman, len(scatter.gt_returns))
+    kept = range(len(sentences.goals)) if made["kept_goals"] is None else made["kept_goals"]
+    return GoalPanel(name, sentences.starts, tuple(sentences.goals[k] for k in kept), *ranking)
 
 
 def episode_panels(name: str, evaluation: Evaluation, scorer: Scorer | None, film: Film) -> list[EpisodePanel]:

@@ -38,8 +38,8 @@ def returns_of(scores: Sequence[FloatArray]) -> Values:
 def value_order(scores: Sequence[FloatArray]) -> Estimate:
     """Value-order correlation: Spearman's ρ of score and time in an episode, averaged over episodes. No ground truth.
 
-    1 is a score that never falls (Ma et al. 2024, https://arxiv.org/abs/2411.04549). Episodes whose scores are constant
-    have no order and count as 0.
+    1 is a score that rises at every step (Ma et al. 2024, https://arxiv.org/abs/2411.04549). Episodes whose scores are
+    constant have no order and count as 0.
     """
     from scipy import stats
 
@@ -54,26 +54,31 @@ def value_order(scores: Sequence[FloatArray]) -> Estimate:
 
 
 def share_told_by_step(scores: Sequence[FloatArray]) -> Estimate:
-    """Share of the scores' variance that the number of the step alone explains, in [0, 1]. No ground truth.
+    """Share of the scores' variance that the number of the step alone tells, in [0, 1]. No ground truth.
 
-    Near 1 the reward is a clock: whatever the robot does, the score at step t is the same. NaN for constant scores.
+    Near 1 the reward is a clock: whatever the robot does, the score at step t is the same. Each episode's scores are
+    told by the mean of the *other* episodes at the same step, against their mean over all steps: 1 − Σ squared error /
+    Σ squared distance, at least 0. NaN for constant scores, and for a single episode.
     """
     _each_with("scores", scores, scores)
     length = max(map(len, scores))
     padded = np.full((len(scores), length), np.nan)
     for row, score in zip(padded, scores, strict=True):
         row[: len(score)] = score
+    known = np.isfinite(padded)
+    filled = np.where(known, padded, 0.0)
+    others = known.sum(axis=0) - known  # how many other episodes have this step
+    by_step = np.divide(filled.sum(axis=0) - filled, others, out=np.zeros_like(filled), where=others > 0)
+    lengths = known.sum(axis=1)
+    by_all = (filled.sum() - filled.sum(axis=1)) / np.maximum(lengths.sum() - lengths, 1)
+    compared = known & (others > 0)
+    error = np.where(compared, (filled - by_step) ** 2, 0.0).sum(axis=1)
+    distance = np.where(compared, (filled - by_all[:, None]) ** 2, 0.0).sum(axis=1)
 
     def share(i: NDArray[np.intp]) -> float:
-        chosen = padded[i]
-        count = np.isfinite(chosen).sum(axis=0)
-        total = np.nanvar(chosen)
-        if total < np.finfo(np.float32).eps ** 2:
+        if distance[i].sum() <= np.finfo(np.float32).eps ** 2 * (filled[i] ** 2).sum():
             return float("nan")
-        seen = count > 0
-        means = np.nansum(chosen[:, seen], axis=0) / count[seen]
-        between = np.average((means - np.average(means, weights=count[seen])) ** 2, weights=count[seen])
-        return float(between / total)
+        return float(max(0.0, 1 - error[i].sum() / distance[i].sum()))
 
     return over_episodes(share, len(scores))
 
@@ -81,7 +86,7 @@ def share_told_by_step(scores: Sequence[FloatArray]) -> Estimate:
 def share_saturated(scores: Sequence[FloatArray]) -> Estimate:
     """Share of frames that score within `SATURATED_BAND` of the dataset's lowest or highest score. No ground truth.
 
-    The larger of the two shares. NaN for constant scores.
+    NaN for constant scores.
     """
     _each_with("scores", scores, scores)
     every = np.concatenate(scores)
@@ -89,9 +94,9 @@ def share_saturated(scores: Sequence[FloatArray]) -> Estimate:
     if low == high:
         return Estimate(float("nan"), float("nan"), float("nan"))
     place = [(score - low) / (high - low) for score in scores]
-    at_ends = [np.array([(p < SATURATED_BAND).mean(), (p > 1 - SATURATED_BAND).mean()]) for p in place]
-    shares, lengths = np.stack(at_ends), np.array([len(score) for score in scores])
-    return over_episodes(lambda i: float(np.average(shares[i], axis=0, weights=lengths[i]).max()), len(scores))
+    shares = np.array([((p < SATURATED_BAND) | (p > 1 - SATURATED_BAND)).mean() for p in place])
+    lengths = np.array([len(score) for score in scores])
+    return over_episodes(lambda i: float(np.average(shares[i], weights=lengths[i])), len(scores))
 
 
 def share_still(states: Sequence[NDArray[np.float64]]) -> Estimate:
@@ -131,7 +136,7 @@ def pairwise_accuracy(returns: Values, truth: Values) -> Estimate:
     Pairs with equal true returns are left out, equal returns count one half. NaN when all true returns are equal.
     """
     a, b = paired(returns, truth)
-    agree = np.sign(a[:, None] - a) * np.sign(b[:, None] - b)
+    agree = (np.sign(a[:, None] - a) * np.sign(b[:, None] - b)).astype(np.int8)
 
     def accuracy(i: NDArray[np.intp]) -> float:
         chosen = agree[np.ix_(i, i)][b[i][:, None] != b[i]]
@@ -174,22 +179,19 @@ def epic_distance(scores: Sequence[FloatArray], truth: Sequence[FloatArray]) -> 
         truth: (T,) per episode, the ground-truth rewards.
     """
     _each_with("ground-truth rewards", scores, truth)
-    sums = np.array(
-        [
-            [len(a), a.sum(), b.sum(), (a * a).sum(), (b * b).sum(), (a * b).sum()]
-            for a, b in (
-                (np.asarray(one, dtype=np.float64), np.asarray(other, dtype=np.float64))
-                for one, other in zip(scores, truth, strict=True)
-            )
-        ]
-    )
+    every = [np.asarray(np.concatenate(rewards), dtype=np.float64) for rewards in (scores, truth)]
+    offsets, largest = [one.mean() for one in every], [np.abs(one).max() for one in every]
+    sums = np.empty((len(scores), 6))
+    for row, one, other in zip(sums, scores, truth, strict=True):
+        a, b = one - offsets[0], other - offsets[1]
+        row[:] = len(a), a.sum(), b.sum(), (a * a).sum(), (b * b).sum(), (a * b).sum()
 
     def distance(i: NDArray[np.intp]) -> float:
         n, a, b, aa, bb, ab = sums[i].sum(axis=0)
-        variances = (aa / n - (a / n) ** 2) * (bb / n - (b / n) ** 2)
-        if variances < np.finfo(np.float64).eps:
+        variances = np.array([aa / n - (a / n) ** 2, bb / n - (b / n) ** 2])
+        if (variances <= np.finfo(np.float32).eps ** 2 * np.square(largest)).any():
             return float("nan")
-        rho = (ab / n - a * b / n**2) / np.sqrt(variances)
+        rho = (ab / n - a * b / n**2) / np.sqrt(variances.prod())
         return float(np.sqrt(np.clip((1 - rho) / 2, 0, 1)))
 
     return over_episodes(distance, len(scores))

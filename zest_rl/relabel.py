@@ -126,9 +126,7 @@ def relabel(
             target_id,
             [rewards_from_scores(score, reward) for score in scores],
             scores,
-            description=(
-                f"Rewards are ZeST scores ({config.similarity}+{config.features}, {reward}) by {config.embedder}."
-            ),
+            description=(f"Rewards are scores ({config.similarity}+{config.features}, {reward}) by {config.embedder}."),
             zest={
                 "relabel": {
                     "source": source_id,

@@ -22,7 +22,7 @@ from zest_rl.errors import BadInput, ZestError
 from zest_rl.frames import Views, canonical_states, scene_pair
 from zest_rl.goals import SAME_SCENE, GoalSpec, embed_goal, read_goal
 from zest_rl.parallel import one_thread, read_arrays, write_arrays
-from zest_rl.scores import Features, Similarity, check_names, score_views, zero_deltas
+from zest_rl.scores import NUMBERS, Features, Similarity, check_names, score_views, zero_deltas
 from zest_rl.tasks import get_task
 from zest_rl.types import FloatArray
 
@@ -229,6 +229,7 @@ class Scorer:
         described = self.describe()
         config = {k: v for k, v in described["config"].items() if k in ("features", "similarity", "goal_share")}
         rule = [] if self.config.goal_share == 1 else ["by last frames"]
+        rule += [f"{name} {number}" for name, number in NUMBERS.items() if name == self.config.features]
         hashes = [described[k] for k in ("goal_sha256", "embedder_sha256", "views_sha256")]
         return artifacts.hash_json([config, *rule, hashes])
 

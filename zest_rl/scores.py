@@ -22,6 +22,8 @@ PROJECTED = 0.5
 """α of `score_projection`: 0 is the plain distance to the goal, 1 sees nothing but the way from start to goal."""
 LOGIT_SCALE = 100.0
 """What CLIP multiplies its cosines by before a softmax."""
+NUMBERS = {"projection": PROJECTED, "classifier": LOGIT_SCALE}
+"""Features → the number that they depend on besides the embeddings."""
 
 ZERO_DELTA = 1e-6
 """A change not longer than this times the embedding it starts from has no direction: its cosine is defined as 0."""
@@ -184,19 +186,20 @@ def score_projection(
     return _mean_over_goals(np.stack(similarities, axis=1))
 
 
+def _covered(distances: Doubles) -> FloatArray:
+    """Distances to the goal (T+1,), summed over goals and views → share of the first one that is covered (T+1,)."""
+    return np.asarray((distances[0] - distances) / (distances[0] if distances[0] > 0 else 1.0), dtype=np.float32)
+
+
 def score_progress(frame_embeddings: FloatArray, goal_embeddings: FloatArray) -> FloatArray:
-    """Share of the distance to the goal that is covered: 1 − ‖x_t − g‖ / ‖x_0 − g‖, averaged over goals.
+    """Share of the distance to the goal that is covered: 1 − Σ ‖x_t − g‖ / Σ ‖x_0 − g‖, sums over goals.
 
     The distance that VIP rewards (Ma et al. 2023, https://arxiv.org/abs/2210.00030), as a ratio so that embedders and
-    goals of other scales compare. An episode that starts at the goal scores minus the distance from there.
+    goals of other scales compare. `score_views` sums over views, too: one that hardly shows the goal hardly counts.
 
     Args, Returns, Raises: see `score_raw`; the first score is 0, 1 is the goal.
     """
-    frames = _check("frame_embeddings", frame_embeddings)
-    goals = _check("goal_embeddings", goal_embeddings, frames.shape[1])
-    distances = -_similarity(frames, goals, "l2")
-    whole = np.where(distances[0] > 0, distances[0], 1.0)
-    return _mean_over_goals((distances[0] - distances) / whole)
+    return _covered(-score_raw(frame_embeddings, goal_embeddings, "l2").astype(np.float64))
 
 
 def score_classifier(
@@ -261,7 +264,7 @@ def score_views(
         elif features == "projection":
             total += score_projection(frames[:, view], starts, goals)
         elif features == "progress":
-            total += score_progress(frames[:, view], goals)
+            total -= score_raw(frames[:, view], goals, "l2")
         else:
             total += score_classifier(frames[:, view], starts, goals)
-    return np.asarray(total / n_views, dtype=np.float32)
+    return _covered(total) if features == "progress" else np.asarray(total / n_views, dtype=np.float32)

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from zest_rl.errors import BadInput
 from zest_rl.metrics import Estimate, Values, over_episodes
 
+Measure = Callable[[Values, NDArray[np.bool_]], float]
+"""Of scores (M,) and which candidates satisfy the goal (M,)."""
 TOP_N = 25
 """N of the paper's tables."""
 
@@ -53,6 +55,11 @@ def top_n_success(scores: Values, satisfies: NDArray[np.bool_], n: int = TOP_N) 
     return float((satisfies[above].sum() + (n - above.sum()) * satisfies[equal].mean()) / n)
 
 
+def top_up_to(scores: Values, satisfies: NDArray[np.bool_], n: int = TOP_N) -> float:
+    """`top_n_success` of the N or, where fewer candidates satisfy the goal, of that many: for resampled candidates."""
+    return top_n_success(scores, satisfies, min(n, int(np.sum(satisfies))))
+
+
 def goal_frame_ratio(satisfies: NDArray[np.bool_]) -> float:
     """Share of the candidates that satisfy the goal, which is what picking at random finds."""
     return float(np.mean(satisfies))
@@ -84,7 +91,7 @@ def relative_variation(scores: Values, satisfies: NDArray[np.bool_]) -> float:
 
 
 def over_trajectories(
-    measure: Callable[[Values, NDArray[np.bool_]], float],
+    measure: Measure,
     scores: Values,
     satisfies: NDArray[np.bool_],
     trajectory: NDArray[np.intp],

@@ -58,10 +58,15 @@ def ensure_video(video: Video) -> Path:
     return video.path if video.path.exists() else write_video(video)
 
 
+def missing(videos: Iterable[Video]) -> dict[Path, Video]:
+    """Return by their paths those videos that are not there."""
+    return {video.path: video for video in videos if not video.path.exists()}
+
+
 def ensure_videos(
     videos: Iterable[Video], *, n_workers: int | None = None, on_done: Callable[[], None] = lambda: None
 ) -> None:
-    """Write the videos that are not there yet, one process per core; those of one path are the same.
+    """Write the `missing` videos, one process per core.
 
     Args:
         videos: what to write.
@@ -71,7 +76,7 @@ def ensure_videos(
     Raises:
         ZestError: a process died; finished videos are kept.
     """
-    jobs = {artifacts.hash_json(str(video.path)): video for video in videos}
+    jobs = {artifacts.hash_json(str(path)): video for path, video in missing(videos).items()}
     with tempfile.TemporaryDirectory() as scratch:
         map_jobs(_ensure, jobs, Path(scratch), n_workers=n_workers, on_done=lambda _: on_done())
 

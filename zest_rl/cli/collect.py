@@ -88,16 +88,19 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
     from zest_rl import artifacts, collect, data, metrics
     from zest_rl.data_writer import write_dataset
+    from zest_rl.envs import ENV_ID
 
     behaviour = config.behaviour()
     dataset_id = config.dataset_id
     asked = {key: value for key, value in asdict(config).items() if key not in ("dataset", "n_workers")}
+    asked["env"] = ENV_ID
     path = data.dataset_path(dataset_id)
     if data.exists(dataset_id):
         made_by = data.read_metadata(dataset_id).get("zest", {}).get("collect", {})
         if not _is_same(asked, made_by):
             raise BadInput(
-                f"dataset {dataset_id} exists and was collected with other arguments ({made_by.get('asked')}); "
+                f"dataset {dataset_id} exists and was collected with other arguments, or in another version of the "
+                f"environment ({made_by.get('asked')}); "
                 f"choose another id with --dataset, or delete {path}"
             )
         ui.say(f"{dataset_id} is there already, nothing to do")

@@ -22,13 +22,15 @@ class Config:
     """Relabeled Minari datasets."""
     output: Path = Path("inspection.html")
     """The HTML page."""
+    n_workers: int | None = None
+    """Processes that embed, with several tasks; default one per core."""
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Measure, warn, write the page."""
-    from zest_rl import data
-    from zest_rl.errors import BadInput
-    from zest_rl.inspection import confusion, confusion_warnings, inspect, inspection_report
+    from zest_rl.errors import BadInput, ZestError
+    from zest_rl.inspection import inspect
+    from zest_rl.inspection_page import confusion, confusion_warnings, inspection_report, labels
     from zest_rl.report import write_report
 
     if not config.datasets:
@@ -39,13 +41,17 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         for dataset in ids:
             inspections.append(inspect(dataset))
             advance()
-    means = None
-    if len({data.task_name(dataset) for dataset in ids}) > 1:
-        with ui.progress("goals against tasks", len(ids)) as advance:
-            means = confusion(ids, on_done=advance)
     warnings = {one.dataset_id: list(one.warnings) for one in inspections}
-    for dataset, warning in ({} if means is None else confusion_warnings(ids, means)).items():
-        warnings[dataset].append(warning)
+    means = None
+    if len({one.task for one in inspections}) > 1:
+        try:
+            with ui.progress("goals against tasks", len(ids)) as advance:
+                means = confusion(inspections, n_workers=config.n_workers, on_done=advance)
+        except ZestError as error:
+            ui.warn(f"goals were not compared across tasks: {error}")
+        else:
+            for dataset, warning in confusion_warnings(inspections, means).items():
+                warnings[dataset].append(warning)
     for dataset, found in warnings.items():
         for warning in found:
             ui.warn(f"{dataset}: {warning}")
@@ -53,13 +59,13 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     return {
         "datasets": {
             one.dataset_id: {
-                "label": one.label,
+                "label": label,
                 "figures": {
                     name: None if estimate is None else {"value": estimate.value, "ci95": [estimate.low, estimate.high]}
                     for name, estimate in one.known_figures().items()
                 },
             }
-            for one in inspections
+            for label, one in zip(labels(inspections), inspections, strict=True)
         },
         "warnings": warnings,
         "goals_against_tasks": None if means is None else means.tolist(),

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from zest_rl.cli.ui import Ui, progress_in_parts
+from zest_rl.scores import Features, Similarity
 
 
 @dataclass(frozen=True)
@@ -22,10 +23,10 @@ class Config:
     embedder: str = "efficientnet-lite0"
     """Frozen network: efficientnet-lite0, open_clip:MODEL/PRETRAINED, torchvision:resnet50, timm:NAME, …@/path,
     transformers:/folder, or a family that another package registers."""
-    features: Literal["delta", "raw", "projection", "progress", "classifier"] = "delta"
+    features: Features = "delta"
     """Compare changes against the start, or the frames themselves; or a reward to compare with: VLM-RM's regularised
     similarity, the share of the distance to the goal that is covered, a classifier of goal against start."""
-    similarity: Literal["cos", "l2"] = "cos"
+    similarity: Similarity = "cos"
     """Cosine, or minus the Euclidean distance."""
     reward: Literal["level", "difference"] = "level"
     """The score after each action, or its change (an ablation)."""

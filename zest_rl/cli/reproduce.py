@@ -46,7 +46,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     from zest_rl import artifacts
     from zest_rl.comparison import overview
     from zest_rl.report import write_report
-    from zest_rl.videos import ensure_videos
+    from zest_rl.videos import ensure_videos, missing
 
     started = time.monotonic()
     output = config.output or Path("runs") / config.file.stem
@@ -70,12 +70,10 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         task: _task_report(plan, task, methods[task], datasets[task], {**details, "collected": collected[task]}, videos)
         for task in datasets
     }
-    with ui.progress("videos", len(videos)) as advance:
-        ensure_videos(videos, n_workers=config.n_workers, on_done=advance)
     if len(reports) == 1:
         (report,) = reports.values()
     else:
-        pages = {task: write_report(page, output / f"{task}.html").name for task, page in reports.items()}
+        pages = {task: f"{task}.html" for task in reports}
         sources = [of_task.source for of_task in datasets.values()]
         report = overview(
             plan.recipe.title,
@@ -87,8 +85,39 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
             caveats=plan.recipe.caveats,
             details=details,
         )
+    result = _result(plan, report, reports, collected, cells, output)
+    artifacts.write_json(output / "result.json", result)
+    artifacts.write_bytes(output / "table.md", markdown(result).encode())
+    with ui.progress("videos", len(missing(videos))) as advance:
+        ensure_videos(videos, n_workers=config.n_workers, on_done=advance)
+    if len(reports) > 1:
+        for task, page in reports.items():
+            write_report(page, output / f"{task}.html")
     html = write_report(report, output / "report.html")
-    result = {
+    if n_run == 0:
+        ui.say("all cells were done already")
+    return {
+        **result,
+        "report": str(html),
+        "result": str(output / "result.json"),
+        "n_cells_run": n_run,
+        "seconds": round(time.monotonic() - started, 1),
+        "next": f"open {html} in a browser",
+    }
+
+
+def _result(
+    plan: Plan,
+    report: Report,
+    reports: Mapping[str, Report],
+    collected: Mapping[str, Any],
+    cells: list[Cell],
+    output: Path,
+) -> dict[str, Any]:
+    """What is written to result.json."""
+    from zest_rl import artifacts
+
+    return {
         "rows": _rows(report.table),
         "tasks": {
             task: {
@@ -106,18 +135,6 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "seeds": list(plan.recipe.seeds),
         "seconds_by_cell": {cell.name: _seconds(cell, output) for cell in cells},
         "provenance": artifacts.provenance(),
-    }
-    artifacts.write_json(output / "result.json", result)
-    artifacts.write_bytes(output / "table.md", markdown(result).encode())
-    if n_run == 0:
-        ui.say("all cells were done already")
-    return {
-        **result,
-        "report": str(html),
-        "result": str(output / "result.json"),
-        "n_cells_run": n_run,
-        "seconds": round(time.monotonic() - started, 1),
-        "next": f"open {html} in a browser",
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
@@ -9,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import tyro
 
 from zest_rl.cli.ui import Ui, progress_in_parts
+from zest_rl.scores import Features, Similarity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,10 +26,10 @@ class Arguments:
     """As in `zest relabel`."""
     embedder: str = "efficientnet-lite0"
     """As in `zest relabel`."""
-    features: Literal["delta", "raw", "projection", "progress", "classifier"] = "delta"
+    features: Features = "delta"
     """Compare changes against the start, or the frames themselves; or a reward to compare with: VLM-RM's regularised
     similarity, the share of the distance to the goal that is covered, a classifier of goal against start."""
-    similarity: Literal["cos", "l2"] = "cos"
+    similarity: Similarity = "cos"
     """Cosine, or minus the Euclidean distance."""
     views: int = 8
     """Cameras around the object; scores are averaged over them."""
@@ -86,6 +88,8 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
     if not config.datasets:
         raise BadInput("`zest select` needs at least 1 dataset; `zest collect` makes them")
     task = get_task(config.task or data.task_name(config.datasets[0]))
+    if config.top < 1 or config.n_repeats < 1:
+        raise BadInput(f"--top and --n-repeats must be at least 1, got {config.top} and {config.n_repeats}")
     candidates = draw_candidates(config.datasets, config.n_frames, config.seed)
     satisfies = candidates.satisfies(task) if isinstance(config, GoalArguments) else candidates.does(task)
     if satisfies.sum() < config.top:
@@ -95,6 +99,8 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
         )
     views = Views(task.name, config.views, robot=config.show_robot, tolerance=config.tolerance)
     scorer = ScorerConfig(views, config.goal, config.embedder, config.features, config.similarity, config.precision)
+    if isinstance(config, GoalArguments) and config.context == "different" and candidates.start_alike(views):
+        ui.warn("all trajectories start with the same picture, so x_0 of another one changes nothing; try --show-robot")
     drawn = config.n_goals is not None or (isinstance(config, GoalArguments) and config.context == "different")
     options: dict[str, Any] = {
         "n_repeats": config.n_repeats if drawn else 1, "n_goals": config.n_goals, "n_workers": config.n_workers,
@@ -104,10 +110,14 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
             scores = score_as_goals(candidates, scorer, context=config.context, on_progress=on_progress, **options)
         else:
             scores = score_as_actions(candidates, scorer, on_progress=on_progress, **options)
-    top = partial(selection.top_n_success, n=config.top)
+    measures: dict[str, selection.Measure] = {
+        "top_n_success": partial(selection.top_up_to, n=config.top),
+        "dataset_total_variation": selection.dataset_total_variation,
+        "relative_variation": selection.relative_variation,
+    }
     found = {
         name: selection.over_trajectories(measure, scores, satisfies, candidates.trajectory)
-        for name, measure in (("top_n_success", top), ("relative_variation", selection.relative_variation))
+        for name, measure in measures.items()
     }
     chance = selection.goal_frame_ratio(satisfies)
     return {
@@ -120,6 +130,7 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
         "times_random": found["top_n_success"].value / chance,
         "n_candidates": len(satisfies),
         "n_satisfying": int(satisfies.sum()),
+        "next": f"zest relabel {config.datasets[0]} --goal {shlex.quote(config.goal)}",
     }
 
 
@@ -136,6 +147,7 @@ def summary(result: Mapping[str, Any]) -> str:
             f"{result['n_satisfying']} of {result['n_candidates']} candidates satisfy it",
             f"  Top-{result['top']} success      {figure('top_n_success')}",
             f"  picking at random   {result['goal_frame_ratio']:.1%}  ({result['times_random']:.1f} times as good)",
-            f"  total variation     {figure('relative_variation')} of the largest",
+            f"  total variation     {result['dataset_total_variation']['value']:.6f}, "
+            f"{figure('relative_variation')} of the largest",
         ]
     )

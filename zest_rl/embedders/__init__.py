@@ -118,7 +118,9 @@ def load_embedder(
 
             return _place(build_lite0(weights), device, bf16)
 
-        fingerprint = hash_json([uri, hash_file(weights), LITE0_PREPROCESSING, bf16, "batch norms folded"])
+        fingerprint = hash_json(
+            [uri, hash_file(weights), LITE0_PREPROCESSING, bf16, "batch norms folded, padded evenly"]
+        )
         return _NetworkEmbedder(uri, fingerprint, 1280, False, batch_size, load_lite0)
 
     from zest_rl.embedders.networks import build
@@ -212,4 +214,4 @@ def _fingerprint(uri: str, network: Network, bf16: bool) -> str:
     state = network.module.state_dict()
     weights = [list(state), hash_arrays(*(value.numpy() for value in state.values()))]
     layout = [re.sub(r" at 0x[0-9a-f]+", "", repr(part)) for part in (network.module, network.preprocess)]
-    return hash_json([uri.partition(":")[0], weights, layout, bf16])
+    return hash_json([uri.partition(":")[0], weights, layout, bf16, network.identity])

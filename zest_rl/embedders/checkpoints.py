@@ -145,7 +145,9 @@ def answers(url: str) -> bool:
 
 def unavailable(uri: str, reason: str) -> ZestError:
     """Return the error that names both ways to work offline."""
+    family, name = uri.partition(":")[0], uri.partition("@")[0]
+    local = "transformers:/path/to/folder" if family == "transformers" else f"{name}@/path/to/checkpoint"
     return ZestError(
         f"{uri} needs files that are not in the cache and cannot be fetched: {reason}; copy its checkpoint here and "
-        f"use {uri.partition('@')[0]}@/path/to/checkpoint, or use {DEFAULT_EMBEDDER}, which is installed"
+        f"use {local}, or use {DEFAULT_EMBEDDER}, which is installed"
     )

@@ -32,7 +32,7 @@ def build(uri: str, source: str) -> Network:
     """Return the image tower, and the text tower where there is one, of a model of any family that has them.
 
     Vectors are `get_image_features` and `get_text_features` where the model has them (CLIP, SigLIP), else its pooled
-    output, or its class token without one (DINOv2 and 3, ViT).
+    output (DINOv2), or its class token where it has no pooling or the checkpoint has no weights for it (ViT, DINO).
 
     Args:
         uri: for messages.
@@ -56,11 +56,14 @@ def build(uri: str, source: str) -> Network:
     if folder.is_dir():
         with checkpoints.reading(folder / "config.json"):
             module, info, processor = load()
+    elif source.startswith(("/", "~", ".")):
+        raise BadInput(f"{source} is not a folder; give one that save_pretrained left, or a name on the hub")
     else:
         module, info, processor = checkpoints.fetch(uri, load)
-    checkpoints.refuse_misfits(
-        folder, type(module).__name__, sorted(info["missing_keys"]), (), sorted(map(str, info["mismatched_keys"]))
-    )
+    missing = sorted(info["missing_keys"])
+    if missing and all(name.startswith("pooler.") for name in missing):
+        module.pooler, missing = None, []  # classifiers are published without it
+    checkpoints.refuse_misfits(folder, type(module).__name__, missing, (), sorted(map(str, info["mismatched_keys"])))
     if processor.model_input_names != ["pixel_values"]:
         raise BadInput(
             f"{uri} wants {', '.join(processor.model_input_names)} of a picture, only models that want pixel_values "
@@ -79,8 +82,11 @@ def build(uri: str, source: str) -> Network:
     def encode_texts(sentences: list[str]) -> torch.Tensor:
         nonlocal tokenizer
         if tokenizer is None:
-            name = str(folder) if folder.is_dir() else source
-            tokenizer = checkpoints.fetch(uri, lambda: AutoTokenizer.from_pretrained(name))
+            if folder.is_dir():
+                with checkpoints.reading(folder / "tokenizer_config.json"):
+                    tokenizer = AutoTokenizer.from_pretrained(str(folder))
+            else:
+                tokenizer = checkpoints.fetch(uri, lambda: AutoTokenizer.from_pretrained(source))
         siglip = module.config.model_type.startswith("siglip")  # which was trained on padded sentences
         length = module.config.text_config.max_position_embeddings
         tokens = tokenizer(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib.metadata
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -45,6 +45,8 @@ class Network:
     """(N, 3, H, W) → (N, D), on the module's device and in its dtype."""
     encode_texts: Callable[[list[str]], torch.Tensor] | None = None
     """N sentences → (N, D); None when it reads no text."""
+    identity: str = ""
+    """Whatever makes it what it is, besides its weights and what its module and preprocessing print."""
 
     def __post_init__(self) -> None:
         self.module.requires_grad_(False).eval()
@@ -109,7 +111,8 @@ def _build_registered(uri: str, rest: str, entry: importlib.metadata.EntryPoint)
             f"{entry.value}, which is registered for {entry.name}:, must return a zest_rl.embedders.networks.Network, "
             f"got {type(network).__name__}"
         )
-    return network
+    version = entry.dist.version if entry.dist is not None else "unknown"
+    return replace(network, identity=f"{uri} of {entry.value} {version}: {network.identity}")
 
 
 def build_lite0(weights: Path) -> Network:
@@ -153,6 +156,7 @@ def _pad_in_convolutions(module: nn.Module) -> None:
     for parent in module.modules():
         for name, conv in list(parent.named_children()):
             if isinstance(conv, Conv2dSame):
+                assert conv.stride == (2, 2), "the place of the zeros is that of stride 2"
                 before = (conv.kernel_size[0] - 2) // 2
                 even = nn.Conv2d(
                     conv.in_channels,
@@ -233,7 +237,7 @@ def _build_moco(path: Path) -> Network:
     whole = checkpoints.read_checkpoint(path)
     state = {name.removeprefix(prefix): value for name, value in whole.items() if name.startswith(prefix)}
     if not state:
-        raise BadInput(f"{path} is not a MoCo v2 checkpoint: no key starts with module.{prefix}")
+        raise BadInput(f"{path} is not a checkpoint of MoCo v1 or v2: no key starts with module.{prefix}")
     return _resnet("resnet50", state, path, models.ResNet50_Weights.IMAGENET1K_V1.transforms())
 
 

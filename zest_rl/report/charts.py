@@ -55,11 +55,17 @@ def axis_over(values: Iterable[float], n_ticks: int, margin: float) -> Axis:
         low, high = low - 0.5, high + 0.5
     rough = (high - low) / n_ticks
     power = 10.0 ** math.floor(math.log10(rough))
-    step = power * next(m for m in (1, 2, 5, 10) if m * power >= rough * 0.999)
     room = margin * (high - low)
     low, high = low - room, high + room
-    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-    return Axis(low, high, tuple(k * step for k in range(first, last + 1)))
+    round_steps = [m * power for m in (0.5, 1, 2, 5, 10)]
+    fewest = next(i for i, step in enumerate(round_steps) if step >= rough * 0.999)
+    ticks: tuple[float, ...] = ()
+    while len(ticks) < 2:  # a step a little shorter than the axis may fall on it once only
+        step = round_steps[fewest]
+        first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+        ticks = tuple(k * step for k in range(first, last + 1))
+        fewest -= 1
+    return Axis(low, high, ticks)
 
 
 def _x_ticks(x: Axis) -> str:

@@ -1,0 +1,137 @@
+"""Inspected datasets → one page: all figures side by side, and which task each goal scores highest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from zest_rl import data
+from zest_rl.inspection import FIGURES, Inspection
+from zest_rl.metrics import Estimate
+from zest_rl.panels import goal_panel, goal_scatter
+from zest_rl.relabel import SCORER_FILE
+from zest_rl.report import Curve, Matrix, QualityRow, QualityTable, Report
+from zest_rl.scorer import Scorer
+from zest_rl.types import FloatArray
+
+
+def labels(inspections: Sequence[Inspection]) -> list[str]:
+    """Name each by task and goal, and by the settings that tell it from others of the same task and goal."""
+    own = [(f"{one.task} by {_goal(one)}", _settings(one)) for one in inspections]
+    names = []
+    for base, settings in own:
+        rivals = [other for name, other in own if name == base]
+        telling = [key for key in settings if any(other[key] != settings[key] for other in rivals)]
+        names.append(", ".join([base, *(f"{key} {settings[key]}" for key in telling)]))
+    return [
+        f"{name} ({one.dataset_id})" if names.count(name) > 1 else name
+        for name, one in zip(names, inspections, strict=True)
+    ]
+
+
+def _goal(inspection: Inspection) -> str:
+    goal = str(inspection.made["scorer"]["config"]["goal"])
+    return Path(goal).name if Path(goal).is_absolute() else goal
+
+
+def _settings(inspection: Inspection) -> dict[str, Any]:
+    """What can tell two rewards of one task and goal apart, by the words of a label."""
+    made, config = inspection.made, inspection.made["scorer"]["config"]
+    return {
+        "embedder": config["embedder"],
+        "features": config["features"],
+        "similarity": config["similarity"],
+        "views": config["views"]["n_views"],
+        "share of goals": config["goal_share"],
+        "reward": made["reward"],
+        "shuffled": "no" if made["shuffle"] is None else made["shuffle"],
+    }
+
+
+def confusion(
+    inspections: Sequence[Inspection], *, n_workers: int | None = None, on_done: Callable[[], object] = lambda: None
+) -> FloatArray:
+    """Score where each dataset's episodes end by the goal of each: (n, n) float32, rows are datasets, columns goals.
+
+    Episodes are seen from the views of their own task, whatever the goal is of. A goal that is worth something scores
+    those of its own task highest. Needs no ground truth.
+
+    Args:
+        inspections: of datasets of several tasks.
+        n_workers: processes that embed, default one per core.
+        on_done: called after each goal.
+
+    Raises:
+        ZestError: a scorer is gone, or was made with another embedder or renderer than the ones here.
+    """
+    ends = [[episode[[0, -1]] for episode in data.read_states(one.dataset_id)] for one in inspections]
+    means = np.empty((len(inspections), len(inspections)), dtype=np.float32)
+    for column, goal_of in enumerate(inspections):
+        goal = Scorer.load(data.dataset_path(goal_of.dataset_id) / SCORER_FILE, n_workers=n_workers)
+        for row, (episodes, seen_as) in enumerate(zip(ends, inspections, strict=True)):
+            config = replace(goal.config, views=replace(goal.config.views, task=seen_as.task))
+            scorer = Scorer(config, goal.starts, goal.goals, goal.goal_fingerprint, n_workers=n_workers)
+            means[row, column] = np.mean([score[-1] for score in scorer.score_episodes(episodes)[0]])
+        on_done()
+    return means
+
+
+def confusion_warnings(inspections: Sequence[Inspection], means: FloatArray) -> dict[str, str]:
+    """Find the goals that score the episodes of another task higher than those of their own: dataset → sentence."""
+    found = {}
+    for column, goal_of in enumerate(inspections):
+        best = int(np.argmax(means[:, column]))
+        if inspections[best].task != goal_of.task:
+            found[goal_of.dataset_id] = (
+                f"Its goal scores the episodes of {inspections[best].task} higher ({means[best, column]:.2f}) than its "
+                f"own ({means[column, column]:.2f})."
+            )
+    return found
+
+
+def inspection_report(
+    inspections: Sequence[Inspection], means: FloatArray | None, warnings: Mapping[str, Sequence[str]]
+) -> Report:
+    """Build the page.
+
+    Args:
+        inspections: one per dataset.
+        means: of `confusion`.
+        warnings: by dataset.
+    """
+    names = tuple(labels(inspections))
+    judged = [one.known_figures() for one in inspections]
+    rows = [
+        QualityRow(figure.name, figure.meaning, tuple(_interval(known.get(figure.name)) for known in judged))
+        for figure in FIGURES
+    ]
+    scatters = {
+        name: goal_scatter(name, one.dataset_id) for name, one in zip(names, inspections, strict=True) if one.has_truth
+    }
+    curves = [
+        Curve(group, f"{name}: mean reward", np.arange(1, len(mean) + 1, dtype=np.float32), mean)
+        for name, one in zip(names, inspections, strict=True)
+        for group, mean in one.over_time.items()
+    ]
+    n_warnings = sum(map(len, warnings.values()))
+    return Report(
+        title="What these rewards are worth",
+        summary_sentence=f"Datasets: {len(names)}, warnings: {n_warnings}. Nothing was trained.",
+        warnings=tuple(f"{dataset}: {sentence}" for dataset, found in warnings.items() for sentence in found),
+        quality=QualityTable(names, tuple(rows)),
+        matrix=None if means is None else Matrix(names, means),
+        goals=tuple(
+            goal_panel(name, one.dataset_id, scatters.get(name)) for name, one in zip(names, inspections, strict=True)
+        ),
+        scatters=tuple(scatters.values()),
+        details={name: {"dataset": one.dataset_id, **one.made} for name, one in zip(names, inspections, strict=True)},
+        scores_over_time=tuple(curves),
+    )
+
+
+def _interval(estimate: Estimate | None) -> tuple[float, float, float] | None:
+    return None if estimate is None else (estimate.value, estimate.low, estimate.high)
