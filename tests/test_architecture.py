@@ -18,7 +18,7 @@ ROOT = PACKAGE.parent
 ORDER = (
     "load_order", "errors", "types", "artifacts", "parallel", "tasks", "data", "data_writer", "metrics", "quality",
     "envs", "arm", "experts", "collect",
-    "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "selection",
+    "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "looks", "selection",
     "relabel", "agents",
     "checkpoints", "training", "evaluation", "report", "panels", "comparison", "inspection",
     "inspection_page", "candidates",

@@ -72,7 +72,7 @@ def test_without_ground_truth_the_rest_is_still_measured(scored: str) -> None:
     assert set(found.figures) == {figure.name for figure in FIGURES} - NEEDS_TRUTH
     assert list(found.over_time) == ["all episodes"]
     assert not found.has_truth
-    page = render_html(inspection_report([found], None, {}))
+    page = render_html(inspection_report([found], None, {}, {}))
     assert "Contradictory" in page
     assert "Ranking" not in page
 
@@ -189,6 +189,7 @@ def test_the_page_shows_tasks_against_goals_and_does_without_where_scorers_are_o
     assert f"<b>{matrix[1][1]:.2f}</b>" in page
     monkeypatch.setattr(rendering, "_RENDERER_VERSION", -1)
     assert zest(*words)["goals_against_tasks"] is None
+    assert "<h2>Frames</h2>" not in (tmp_path / "page.html").read_text()
     assert "<h2>Reward quality</h2>" in (tmp_path / "page.html").read_text()
 
 
@@ -204,7 +205,7 @@ def test_the_verb_prints_figures_warns_and_leaves_a_page(
     assert not any("shuffled?" in warning for warning in result["warnings"][scored])
     assert result["goals_against_tasks"] is None, "both are of one task"
     page = (tmp_path / "page.html").read_text()
-    for heading in ("Warnings", "Reward quality", "Ranking", "Scores over time"):
+    for heading in ("Warnings", "Reward quality", "Ranking", "Frames", "Views", "Pixels", "Scores over time"):
         assert f"<h2>{heading}</h2>" in page
     json.dumps(result, allow_nan=False)
 

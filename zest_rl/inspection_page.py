@@ -11,10 +11,11 @@ import numpy as np
 
 from zest_rl import data
 from zest_rl.inspection import FIGURES, Inspection
-from zest_rl.metrics import Estimate
+from zest_rl.looks import Look
+from zest_rl.metrics import Estimate, spearman
 from zest_rl.panels import goal_panel, goal_scatter
 from zest_rl.relabel import SCORER_FILE
-from zest_rl.report import Curve, Matrix, QualityRow, QualityTable, Report
+from zest_rl.report import Curve, Matrix, QualityRow, QualityTable, Report, Scatter, Strip
 from zest_rl.scorer import Scorer
 from zest_rl.types import FloatArray
 
@@ -93,8 +94,62 @@ def confusion_warnings(inspections: Sequence[Inspection], means: FloatArray) -> 
     return found
 
 
+def look_at(inspection: Inspection, *, n_workers: int | None = None) -> dict[str, Look]:
+    """Look at the episodes with the highest and the lowest return: "best" and "worst".
+
+    Args:
+        inspection: of a dataset.
+        n_workers: processes that embed, default one per core.
+
+    Raises:
+        ZestError: the scorer is gone, or was made with another embedder or renderer than the ones here.
+    """
+    scorer = Scorer.load(data.dataset_path(inspection.dataset_id) / SCORER_FILE, n_workers=n_workers)
+    returns = [episode.rewards.sum(dtype=np.float64) for episode in data.read_episodes(inspection.dataset_id)]
+    states = data.read_states(inspection.dataset_id)
+    return {
+        "best": Look.at(scorer, states[int(np.argmax(returns))]),
+        "worst": Look.at(scorer, states[int(np.argmin(returns))]),
+    }
+
+
+def _strips(name: str, dataset_id: str, looks: Mapping[str, Look]) -> list[Strip]:
+    scores = np.concatenate(data.read_scores(dataset_id))
+    low, size = float(scores.min()), float(np.ptp(scores)) or 1.0
+    return [
+        Strip(
+            f"{name}: {which}", tuple(look.frames), tuple(map(int, look.steps)), (look.scores[look.steps] - low) / size
+        )
+        for which, look in looks.items()
+    ]
+
+
+def _views(name: str, look: Look) -> list[Curve]:
+    steps = np.arange(len(look.scores), dtype=np.float32)
+    by_view = [(f"view {view}", scores) for view, scores in enumerate(look.by_view, 1)]
+    return [Curve(view, f"{name}: score", steps, scores) for view, scores in [("mean", look.scores), *by_view]]
+
+
+def _pixels(name: str, look: Look) -> Scatter:
+    changed, scores = look.pixel_difference[1:], look.scores[1:]
+    rho = spearman(changed.astype(np.float64), scores.astype(np.float64))
+    return Scatter(
+        name,
+        scores,
+        changed,
+        rho.value,
+        (rho.low, rho.high),
+        upward="ZeST score",
+        across="mean pixel difference",
+        point="step",
+    )
+
+
 def inspection_report(
-    inspections: Sequence[Inspection], means: FloatArray | None, warnings: Mapping[str, Sequence[str]]
+    inspections: Sequence[Inspection],
+    means: FloatArray | None,
+    warnings: Mapping[str, Sequence[str]],
+    looks: Mapping[str, Mapping[str, Look]],
 ) -> Report:
     """Build the page.
 
@@ -102,6 +157,7 @@ def inspection_report(
         inspections: one per dataset.
         means: of `confusion`.
         warnings: by dataset.
+        looks: of `look_at`, by dataset; those that are missing are not shown.
     """
     names = tuple(labels(inspections))
     judged = [one.known_figures() for one in inspections]
@@ -117,6 +173,7 @@ def inspection_report(
         for name, one in zip(names, inspections, strict=True)
         for group, mean in one.over_time.items()
     ]
+    seen = {one.dataset_id: name for name, one in zip(names, inspections, strict=True) if one.dataset_id in looks}
     n_warnings = sum(map(len, warnings.values()))
     return Report(
         title="What these rewards are worth",
@@ -128,6 +185,9 @@ def inspection_report(
             goal_panel(name, one.dataset_id, scatters.get(name)) for name, one in zip(names, inspections, strict=True)
         ),
         scatters=tuple(scatters.values()),
+        strips=tuple(s for dataset, name in seen.items() for s in _strips(name, dataset, looks[dataset])),
+        views=tuple(c for dataset, name in seen.items() for c in _views(name, looks[dataset]["best"])),
+        pixels=tuple(_pixels(name, looks[dataset]["best"]) for dataset, name in seen.items()),
         details={name: {"dataset": one.dataset_id, **one.made} for name, one in zip(names, inspections, strict=True)},
         scores_over_time=tuple(curves),
     )

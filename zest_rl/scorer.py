@@ -128,6 +128,17 @@ class Scorer:
             n_still += int(still[1:][inverse[1:]].sum())
         return scores, n_still
 
+    def score_by_view(self, states: NDArray[np.float64]) -> FloatArray:
+        """Score one episode by each view alone: (T+1, nq) → (V, T+1) float32; their mean is the score."""
+        ((frames, inverse),) = self._frames([states], None)
+        rows = []
+        for view in range(frames.shape[1]):
+            own = slice(view, view + 1)
+            starts, goals = (rows_[own] if rows_.ndim == 3 else rows_ for rows_ in (self.starts, self.goals))
+            scores = score_views(frames[:, own], starts, goals, self.config.features, self.config.similarity)
+            rows.append(scores[1:][inverse])
+        return np.stack(rows)
+
     def select_goals(
         self, states: Sequence[NDArray[np.float64]], on_progress: Callable[[int, int], None] | None = None
     ) -> NDArray[np.intp]:

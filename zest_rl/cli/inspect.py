@@ -30,7 +30,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Measure, warn, write the page."""
     from zest_rl.errors import BadInput, ZestError
     from zest_rl.inspection import inspect
-    from zest_rl.inspection_page import confusion, confusion_warnings, inspection_report, labels
+    from zest_rl.inspection_page import confusion, confusion_warnings, inspection_report, labels, look_at
     from zest_rl.report import write_report
 
     if not config.datasets:
@@ -42,6 +42,14 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
             inspections.append(inspect(dataset))
             advance()
     warnings = {one.dataset_id: list(one.warnings) for one in inspections}
+    looks = {}
+    with ui.progress("episodes to look at", len(ids)) as advance:
+        for one in inspections:
+            try:
+                looks[one.dataset_id] = look_at(one, n_workers=config.n_workers)
+            except ZestError as error:
+                ui.warn(f"no episode of {one.dataset_id} is shown: {error}")
+            advance()
     means = None
     if len({one.task for one in inspections}) > 1:
         try:
@@ -55,7 +63,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     for dataset, found in warnings.items():
         for warning in found:
             ui.warn(f"{dataset}: {warning}")
-    page = write_report(inspection_report(inspections, means, warnings), config.output)
+    page = write_report(inspection_report(inspections, means, warnings, looks), config.output)
     return {
         "datasets": {
             one.dataset_id: {

@@ -14,10 +14,11 @@ from zest_rl.report.data import (
     Report,
     Scatter,
     Section,
+    Strip,
 )
 from zest_rl.report.page import render_html, write_report
 
 __all__ = [
     "Curve", "EpisodePanel", "GoalPanel", "Matrix", "MethodRow", "QualityRow", "QualityTable", "Report", "Scatter",
-    "Section", "render_html", "write_report",
+    "Section", "Strip", "render_html", "write_report",
 ]  # fmt: skip

@@ -124,14 +124,15 @@ def scatter_chart(scatter: Scatter) -> str:
     """Return one dot per episode with a hover title, ground truth across, ZeST upward; only finite pairs."""
     finite = np.flatnonzero(np.isfinite(scatter.gt_returns) & np.isfinite(scatter.zest_returns))
     x, y = axis_over(scatter.gt_returns[finite], 4, 0.05), axis_over(scatter.zest_returns[finite], 6, 0.05)
+    point, upward, across = (escape(text) for text in (scatter.point, scatter.upward, scatter.across))
     dots = []
     for i in finite:
         gt, zest = float(scatter.gt_returns[i]), float(scatter.zest_returns[i])
         dots.append(
             f'<circle class="point" cx="{x.percent(gt):.2f}%" cy="{100 - y.percent(zest):.2f}%" r="4">'
-            f"<title>episode {i}: ZeST return {number(zest)}, ground-truth return {number(gt)}</title></circle>"
+            f"<title>{point} {i}: {upward} {number(zest)}, {across} {number(gt)}</title></circle>"
         )
-    label = f"{scatter.name}: {len(finite)} episodes, Spearman {number(scatter.spearman)}"
+    label = f"{scatter.name}: {len(finite)} {scatter.point}s, Spearman {number(scatter.spearman)}"
     marks = _x_ticks(x) + _y_ticks(y) + "".join(dots)
     return f'<svg class="chart square" role="img" aria-label="{escape(label)}">{marks}</svg>'
 

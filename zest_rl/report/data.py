@@ -116,7 +116,7 @@ class EpisodePanel:
 
 @dataclass(frozen=True)
 class Scatter:
-    """ZeST return against ground-truth return, one point for each episode of a dataset."""
+    """ZeST return against ground-truth return, one point for each episode of a dataset; or what else the names say."""
 
     name: str
     zest_returns: FloatArray
@@ -127,6 +127,9 @@ class Scatter:
     """Rank correlation, in [-1, 1]."""
     ci: tuple[float, float] | None = None
     """95 % confidence interval of `spearman`."""
+    upward: str = "ZeST return"
+    across: str = "ground-truth return"
+    point: str = "episode"
 
     def __post_init__(self) -> None:
         _check_equal_lengths(self.name, {"zest_returns": len(self.zest_returns), "gt_returns": len(self.gt_returns)})
@@ -163,6 +166,23 @@ class Section:
     table: tuple[MethodRow, ...]
     page: str
     """File name, beside the report, of the task's own report."""
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Frames of one episode in a row, with their scores below."""
+
+    title: str
+    frames: tuple[Frame, ...]
+    steps: tuple[int, ...]
+    """Which step of the episode each is."""
+    scores: FloatArray
+    """(n,) float32, normalised: 0 is the lowest and 1 the highest score of the dataset."""
+
+    def __post_init__(self) -> None:
+        _check_equal_lengths(
+            self.title, {"frames": len(self.frames), "steps": len(self.steps), "scores": len(self.scores)}
+        )
 
 
 @dataclass(frozen=True)
@@ -215,6 +235,11 @@ class Report:
     goals: tuple[GoalPanel, ...] = ()
     episodes: tuple[EpisodePanel, ...] = ()
     scatters: tuple[Scatter, ...] = ()
+    strips: tuple[Strip, ...] = ()
+    views: tuple[Curve, ...] = ()
+    """Scores of one episode by each view."""
+    pixels: tuple[Scatter, ...] = ()
+    """Scores against how many pixels change."""
     scores_over_time: tuple[Curve, ...] = ()
     """Mean scores; their `steps` are those of an episode."""
     curves: tuple[Curve, ...] = ()

@@ -21,7 +21,7 @@ from zest_rl import artifacts
 from zest_rl.errors import BadInput
 from zest_rl.report import charts
 from zest_rl.report.charts import MISSING, Line, number
-from zest_rl.report.data import Curve, EpisodePanel, GoalPanel, Matrix, MethodRow, QualityTable, Report, Scatter
+from zest_rl.report.data import Curve, EpisodePanel, GoalPanel, Matrix, MethodRow, QualityTable, Report, Scatter, Strip
 from zest_rl.types import Frame
 
 THUMBNAIL = 160
@@ -124,12 +124,24 @@ def _scatter(scatter: Scatter) -> str:
     n_hidden = len(scatter.zest_returns) - n_shown
     ci = f" ({_between(*scatter.ci, 2)})" if scatter.ci else ""
     hidden = f", {n_hidden} without a finite return not shown" if n_hidden else ""
+    upward, across = (escape(text[:1].upper() + text[1:]) for text in (scatter.upward, scatter.across))
     return (
         f'<figure class="card"><figcaption><h3>{escape(scatter.name)}</h3>'
-        f'<p class="note"><b>ρ = {number(scatter.spearman)}</b>{ci}, {_count(n_shown, "episode")}{hidden}</p>'
-        f'</figcaption><p class="axis-name upward">ZeST return ↑</p>{charts.scatter_chart(scatter)}'
-        '<p class="axis-name across">Ground-truth return →</p></figure>'
+        f'<p class="note"><b>ρ = {number(scatter.spearman)}</b>{ci}, {escape(_count(n_shown, scatter.point))}{hidden}</p>'
+        f'</figcaption><p class="axis-name upward">{upward} ↑</p>{charts.scatter_chart(scatter)}'
+        f'<p class="axis-name across">{across} →</p></figure>'
     )
+
+
+def _strip(strip: Strip) -> str:
+    cells = "".join(
+        f'<li><img src="{_png(frame)}" alt="step {step} of {escape(strip.title)}">'
+        f'<svg class="level"><rect width="{100 * min(max(float(score), 0), 1):.0f}%" height="100%" rx="3"/></svg>'
+        f"<b>{number(float(score))}</b>{_note(f'step {step}')}</li>"
+        for frame, step, score in zip(strip.frames, strip.steps, strip.scores, strict=True)
+    )
+    title = f"<figcaption><h3>{escape(strip.title)}</h3></figcaption>"
+    return f'<figure class="card">{title}<ol class="strip">{cells}</ol></figure>'
 
 
 def _track(style: str, name: str, remark: str, chart: str) -> str:
@@ -295,6 +307,16 @@ def _sections(report: Report) -> list[tuple[str, str, str]]:
         intro = "One dot is one episode. A reward worth training on ranks episodes as ground truth does."
         body = f'<div class="small grid-of">{"".join(map(_scatter, report.scatters))}</div>'
         sections.append(("Ranking", intro, body))
+    if report.strips:
+        intro = "Frames of one episode; below, their score between the dataset's lowest (0) and highest (1)."
+        sections.append(("Frames", intro, "".join(map(_strip, report.strips))))
+    if report.views:
+        intro = "The same episode by each view alone; the reward is their mean."
+        sections.append(("Views", intro, _curves(report.views, "Step")))
+    if report.pixels:
+        intro = "One dot is one step of that episode: a score worth training on is not the amount of change."
+        body = f'<div class="small grid-of">{"".join(map(_scatter, report.pixels))}</div>'
+        sections.append(("Pixels", intro, body))
     if report.scores_over_time:
         intro = "Mean score at each step: a reward worth training on parts successes from failures."
         sections.append(("Scores over time", intro, _curves(report.scores_over_time, "Step")))
