@@ -127,7 +127,8 @@ def _scatter(scatter: Scatter) -> str:
     upward, across = (escape(text[:1].upper() + text[1:]) for text in (scatter.upward, scatter.across))
     return (
         f'<figure class="card"><figcaption><h3>{escape(scatter.name)}</h3>'
-        f'<p class="note"><b>ρ = {number(scatter.spearman)}</b>{ci}, {escape(_count(n_shown, scatter.point))}{hidden}</p>'
+        f'<p class="note"><b>ρ = {number(scatter.spearman)}</b>{ci}, '
+        f"{escape(_count(n_shown, scatter.point))}{hidden}</p>"
         f'</figcaption><p class="axis-name upward">{upward} ↑</p>{charts.scatter_chart(scatter)}'
         f'<p class="axis-name across">{across} →</p></figure>'
     )
