@@ -19,11 +19,11 @@ ORDER = (
     "load_order", "errors", "types", "artifacts", "parallel", "tasks", "data", "data_writer", "metrics", "quality",
     "envs", "arm", "experts", "collect",
     "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "looks", "selection",
-    "relabel", "agents",
+    "footage", "relabel", "agents",
     "checkpoints", "training", "evaluation", "report", "panels", "comparison", "inspection",
     "inspection_page", "candidates",
-    "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.inspect", "cli.select",
-    "cli.train", "cli.evaluate", "cli.report", "cli.plans", "cli.studies",
+    "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.inspect", "cli.select_footage",
+    "cli.select", "cli.train", "cli.evaluate", "cli.report", "cli.plans", "cli.studies",
     "cli.reproduce",
 )  # fmt: skip
 """The pipeline: a module imports only what stands before it. A folder is listed once, its files share the place."""

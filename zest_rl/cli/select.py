@@ -1,4 +1,7 @@
-"""``zest select goals`` and ``zest select actions``: does a goal find the frames that reach it in a dataset?"""
+"""``zest select goals`` and ``zest select actions``: does a goal find the frames that reach it in a dataset?
+
+``zest select footage`` asks the same of real video.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
+from zest_rl.cli import select_footage
 from zest_rl.cli.ui import Ui, progress_in_parts
 from zest_rl.scores import Features, Similarity
 
@@ -71,11 +75,15 @@ class ActionArguments(Arguments):
     what: ClassVar[str] = "actions"
 
 
-CONFIGS = {config.what: config for config in (GoalArguments, ActionArguments)}
+CONFIGS: dict[str, type[Any]] = {
+    config.what: config for config in (GoalArguments, ActionArguments, select_footage.FootageArguments)
+}
 
 
-def run(config: Arguments, ui: Ui) -> dict[str, Any]:
+def run(config: Arguments | select_footage.FootageArguments, ui: Ui) -> dict[str, Any]:
     """Draw candidates, score them, judge the highest scores."""
+    if isinstance(config, select_footage.FootageArguments):
+        return select_footage.run(config, ui)
     from functools import partial
 
     from zest_rl import data, selection
@@ -136,6 +144,8 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
 
 def summary(result: Mapping[str, Any]) -> str:
     """What was found, as text."""
+    if result["select"] == "footage":
+        return select_footage.summary(dict(result))
 
     def figure(name: str) -> str:
         low, high = result[name]["ci95"]

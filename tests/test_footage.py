@@ -1,0 +1,184 @@
+"""Clips: videos and picture folders made of rendered kitchen scenes, read, embedded and selected from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+from PIL import Image
+
+from zest_rl.embedders import load_embedder
+from zest_rl.envs import KitchenEnv
+from zest_rl.errors import BadInput
+from zest_rl.footage import (
+    GOAL_SHARE,
+    LABELS,
+    OPENING,
+    VIDEOS,
+    Clip,
+    candidates,
+    embed_clips,
+    folder_of_clips,
+    read_clip,
+    something_something,
+)
+from zest_rl.frames import Views
+from zest_rl.scores import score_delta
+from zest_rl.tasks import TASKS
+
+N = 12
+THINGS = {"oven": "micro", "drawer": "sdoor"}
+"""Objects of the labels → what stands for them in the kitchen."""
+
+
+@pytest.fixture(scope="module")
+def openings() -> dict[str, list[list[np.ndarray]]]:
+    """Three clips per object: its joint opens, seen from three sides."""
+    start = KitchenEnv("micro").start_qpos
+    clips: dict[str, list[list[np.ndarray]]] = {}
+    for thing, name in THINGS.items():
+        task = TASKS[name]
+        with Views(name, n_views=3, size=64).renderer() as renderer:
+            states = [renderer.with_joint(start, task.joint, share * task.goal) for share in np.linspace(0, 1, N)]
+            frames = np.stack([renderer.render(state) for state in states])
+        clips[thing] = [list(frames[:, view]) for view in range(3)]
+    return clips
+
+
+@pytest.fixture
+def root(openings: dict[str, list[list[np.ndarray]]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The clips as Something-Something V2 has them, beside labels of another action and another object."""
+    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
+    root = tmp_path / "ssv2"
+    (root / VIDEOS).mkdir(parents=True)
+    labels = []
+    for thing, clips in openings.items():
+        for clip in clips:
+            name = str(1000 + len(labels))
+            imageio.mimwrite(root / VIDEOS / f"{name}.webm", clip, fps=12, codec="libvpx-vp9", quality=9)
+            labels.append({"id": name, "template": OPENING, "placeholders": [f"a kitchen {thing}"]})
+    labels.append({"id": "1", "template": "Closing [something]", "placeholders": ["oven"]})
+    labels.append({"id": "2", "template": OPENING, "placeholders": ["a bottle"]})
+    labels.append({"id": "3", "template": OPENING, "placeholders": ["oven"]})  # its video was not downloaded
+    (root / LABELS.replace("*", "train")).write_text(json.dumps(labels))
+    (root / LABELS.replace("*", "labels")).write_text(json.dumps({OPENING: "46"}))
+    return root
+
+
+def test_a_video_is_read_from_its_first_frame_to_its_last(
+    root: Path, openings: dict[str, list[list[np.ndarray]]]
+) -> None:
+    path = root / VIDEOS / "1000.webm"
+    frames = read_clip(path, N)
+    error = [np.abs(a.astype(float) - b).mean() for a, b in zip(frames, openings["oven"][0], strict=True)]
+    assert max(error) < 8, "video is lossy"
+    few = read_clip(path, 3)
+    for frame, index in zip(few, (0, round((N - 1) / 2), N - 1), strict=True):
+        np.testing.assert_array_equal(frame, frames[index])
+    assert len(read_clip(path, 99)) == N
+
+
+def test_a_folder_of_pictures_is_a_clip_too(openings: dict[str, list[list[np.ndarray]]], tmp_path: Path) -> None:
+    folder = tmp_path / "oven" / "first"
+    folder.mkdir(parents=True)
+    for i, frame in enumerate(openings["oven"][0]):
+        Image.fromarray(frame).save(folder / f"{i:03d}.png")
+    np.testing.assert_array_equal(read_clip(folder, N), openings["oven"][0])
+    assert folder_of_clips(tmp_path) == [Clip(folder, "oven")]
+
+
+def test_the_clips_of_one_action_on_the_objects_are_found(root: Path) -> None:
+    clips = something_something(root)
+    assert [clip.thing for clip in clips] == ["oven"] * 3 + ["drawer"] * 3
+    assert [clip.path.stem for clip in clips] == [str(1000 + i) for i in range(6)]
+    assert [clip.thing for clip in something_something(root, things=("drawer",))] == ["drawer"] * 3
+
+
+def test_clips_are_embedded_once(root: Path) -> None:
+    clips, embedder = something_something(root)[:2], load_embedder("efficientnet-lite0")
+    done: list[None] = []
+    first = embed_clips(clips, embedder, 4, on_done=lambda: done.append(None))
+    np.testing.assert_allclose(first[0], embedder.embed_images(read_clip(clips[0].path, 4)), atol=1e-4)
+    assert len(done) == 2
+    copies = [Clip(clip.path.rename(root / VIDEOS / f"moved-{clip.path.name}"), "oven") for clip in clips]
+
+    class Refusing:
+        fingerprint = embedder.fingerprint
+
+    again = embed_clips(copies, Refusing(), 4)  # type: ignore[arg-type]  # it fails when it is asked to embed
+    np.testing.assert_array_equal(again, first)
+
+
+def test_candidates_are_the_frames_of_the_other_clips() -> None:
+    clips = [Clip(Path(str(i)), thing) for i, thing in enumerate("aaabb")]
+    embeddings = [np.full((5, 2), 10 * i, np.float32) + np.arange(5, dtype=np.float32)[:, None] for i in range(5)]
+    narrow = candidates(clips, embeddings, 1, diverse=False, same_context=True, seed=0)
+    assert set(narrow.clip) == {0, 2}
+    assert len(narrow.embeddings) == 8, "x_0 is no candidate"
+    np.testing.assert_array_equal(narrow.starts[:, 0], 10 * narrow.clip)
+    assert round(5 * GOAL_SHARE) == 1
+    np.testing.assert_array_equal(narrow.satisfies, narrow.embeddings[:, 0] % 10 == 4)
+    other = candidates(clips, embeddings, 1, diverse=True, same_context=False, seed=0)
+    assert set(other.clip) == {0, 2, 3, 4}
+    assert (other.starts[:, 0] != 10 * other.clip).all()
+    assert set(other.starts[:, 0] / 10) <= {0, 2, 3, 4}
+    assert set(other.clip[other.satisfies]) == {0, 2}, "the end of another object is no goal"
+    with pytest.raises(BadInput, match="at least 3 clips of 'b' are needed"):
+        candidates(clips, embeddings, 3, diverse=False, same_context=True, seed=0)
+
+
+def test_the_verb_judges_the_frames_that_score_highest(root: Path, zest: Callable[..., dict[str, Any]]) -> None:
+    words = ("select", "footage", root, "--layout", "something-something", "--n-frames", N, "--top", 4)
+    narrow = zest(*words)
+    assert set(narrow["objects"]) == set(THINGS)
+    assert narrow["n_clips"] == 6
+    for row in narrow["objects"].values():
+        assert (row["n_clips"], row["n_goals"]) == (3, 3)
+        assert row["goal_frame_ratio"] == pytest.approx(2 / 11)
+        assert row["top_n_success"]["ci95"][0] <= row["top_n_success"]["value"] <= row["top_n_success"]["ci95"][1]
+    embedder = load_embedder("efficientnet-lite0")
+    clips = [embedder.embed_images(read_clip(root / VIDEOS / f"{1000 + i}.webm", N)) for i in range(3)]
+    shares = []
+    for goal in range(3):
+        scored = [
+            (score_delta(clip, clips[goal][:1], clips[goal][-1:])[t], t >= N - 2)
+            for i, clip in enumerate(clips)
+            for t in range(1, N)
+            if i != goal
+        ]
+        shares.append(np.mean([reached for _, reached in sorted(scored, reverse=True)[:4]]))
+    assert narrow["objects"]["oven"]["top_n_success"]["value"] == pytest.approx(np.mean(shares))
+    diverse = zest(*words, "--pool", "all", "--context", "different")
+    assert diverse["mean"]["goal_frame_ratio"] == pytest.approx(4 / 55)
+    assert diverse["objects"] != narrow["objects"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda root: (root / VIDEOS / "1000.webm").write_bytes(b"no video"), r"1000\.webm cannot be read as a video"),
+        (lambda root: (root / VIDEOS / "1000.webm").write_bytes(b""), r"1000\.webm cannot be read as a video"),
+        (lambda root: (root / LABELS.replace("*", "train")).write_text("{"), "is not a list of labels"),
+        (lambda root: (root / LABELS.replace("*", "train")).write_text("[]"), "no clip is of 'Opening"),
+        (lambda root: (root / LABELS.replace("*", "train")).unlink(), "as Something-Something V2 does"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_by_name(root: Path, spoil: Callable[[Path], object], message: str) -> None:
+    spoil(root)
+    with pytest.raises(BadInput, match=message):
+        read_clip(something_something(root)[0].path, 4)
+
+
+def test_a_folder_without_clips_is_refused(tmp_path: Path) -> None:
+    for root in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(BadInput, match="must hold a folder per object"):
+            folder_of_clips(root)
+    with pytest.raises(BadInput, match="is not a file"):
+        read_clip(tmp_path / "nowhere.mp4", 4)
+    with pytest.raises(BadInput, match="at least 2 frames"):
+        read_clip(tmp_path, 1)

@@ -1,0 +1,214 @@
+"""Real video: clips as files or as folders of pictures, and folders laid out as Something-Something V2.
+
+A clip shows one object that is acted on from its start to its end: its first frame is a start, its last one a goal, and
+its last `GOAL_SHARE` of frames count as reaching the goal of the same object. That reading is ours; Cui et al. 2022
+(§5.2) do not say which frames do.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl import artifacts
+from zest_rl.embedders import Embedder
+from zest_rl.errors import BadInput, nearest
+from zest_rl.images import list_images, read_image
+from zest_rl.parallel import one_thread, read_arrays, write_arrays
+from zest_rl.types import FloatArray, Frame
+
+OPENING = "Opening [something]"
+OBJECTS = ("door", "drawer", "box", "fridge", "laptop", "washing machine", "oven")
+"""The seven objects of the paper."""
+GOAL_SHARE = 0.2
+VIDEOS, LABELS = "20bn-something-something-v2", "something-something-v2-*.json"
+VIDEO_SUFFIXES = (".avi", ".mkv", ".mov", ".mp4", ".webm")
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One video of one object."""
+
+    path: Path
+    """A video file, or a folder of pictures in the order of their names."""
+    thing: str
+    """What is acted on."""
+
+
+def read_clip(path: Path, n_frames: int) -> list[Frame]:
+    """Read frames that are evenly spaced over a clip, the first and the last among them.
+
+    Args:
+        path: a video file that ffmpeg reads, or a folder of pictures.
+        n_frames: how many; a shorter clip gives all it has.
+
+    Returns:
+        (H, W, 3) uint8 RGB each.
+
+    Raises:
+        BadInput: nothing there, no video, or fewer than 2 frames.
+    """
+    if n_frames < 2:
+        raise BadInput(f"a clip needs at least 2 frames, its first and its last, got {n_frames}")
+    if path.is_dir():
+        pictures = list_images(path)
+        frames = [read_image(pictures[i]) for i in _even(len(pictures), n_frames)]
+    elif not path.is_file():
+        raise BadInput(f"{path} is not a file; give a video or a folder of pictures")
+    else:
+        try:
+            with imageio.get_reader(path, "ffmpeg") as video:
+                reader: Any = video
+                wanted = set(_even(reader.count_frames(), n_frames).tolist())
+                frames = [np.asarray(frame) for i, frame in enumerate(reader.iter_data()) if i in wanted]
+        except (OSError, RuntimeError, ValueError, IndexError) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise BadInput(f"{path} cannot be read as a video ({reason}); copy it, or convert it to MP4") from error
+    if len(frames) < 2:
+        raise BadInput(f"{path} has {len(frames)} frames, at least 2 are needed; remove it")
+    return frames
+
+
+def _even(n: int, n_wanted: int) -> NDArray[np.intp]:
+    return np.unique(np.linspace(0, n - 1, min(n, n_wanted)).round().astype(np.intp)) if n else np.zeros(0, np.intp)
+
+
+def something_something(root: Path, things: Sequence[str] = OBJECTS, template: str = OPENING) -> list[Clip]:
+    """Find the clips of one action on some objects in a folder laid out as Something-Something V2.
+
+    The folder holds ``20bn-something-something-v2/ID.webm`` and ``something-something-v2-train.json`` (or
+    ``-validation``), a list of ``{"id", "template", "placeholders"}``. A clip is of an object when its first
+    placeholder ends with it: "a kitchen drawer" is a drawer.
+
+    Raises:
+        BadInput: the layout is another one, or no clip is found.
+    """
+    files = sorted(root.glob(LABELS)) if root.is_dir() else []
+    files = [path for path in files if not path.name.endswith(("labels.json", "test.json"))]
+    if not files or not (root / VIDEOS).is_dir():
+        raise BadInput(f"{root} must hold {VIDEOS}/ and {LABELS.replace('*', 'train')}, as Something-Something V2 does")
+    clips, templates = [], set()
+    for file in files:
+        try:
+            entries = json.loads(file.read_text(encoding="utf-8"))
+            for entry in entries:
+                templates.add(entry["template"])
+                if entry["template"] == template:
+                    words = str(entry["placeholders"][0]).lower()
+                    thing = next((thing for thing in things if words.endswith(thing)), None)
+                    path = root / VIDEOS / f"{entry['id']}.webm"
+                    if thing is not None and path.is_file():
+                        clips.append(Clip(path, thing))
+        except (ValueError, KeyError, TypeError, IndexError) as error:
+            raise BadInput(f"{file} is not a list of labels ({error!r}); download it again") from error
+    if template not in templates:
+        raise BadInput(f"no clip is of {template!r}; {nearest(template, templates)}")
+    if not clips:
+        raise BadInput(f"{root} has no video of {template!r} with {', '.join(things)}")
+    return clips
+
+
+def folder_of_clips(root: Path) -> list[Clip]:
+    """Find clips that are sorted by object: ``ROOT/OBJECT/CLIP.mp4``, or ``ROOT/OBJECT/CLIP/`` with pictures.
+
+    Raises:
+        BadInput: there is none.
+    """
+    clips = [
+        Clip(path, thing.name)
+        for thing in (sorted(root.iterdir()) if root.is_dir() else [])
+        if thing.is_dir() and not thing.name.startswith(".")
+        for path in sorted(thing.iterdir())
+        if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES
+    ]
+    if not clips:
+        raise BadInput(f"{root} must hold a folder per object with videos, or folders of pictures, in it")
+    return clips
+
+
+def embed_clips(
+    clips: Sequence[Clip], embedder: Embedder, n_frames: int, on_done: Callable[[], object] = lambda: None
+) -> list[FloatArray]:
+    """Embed clips, each once: what was embedded is kept in the cache, by content.
+
+    Args:
+        clips: what to embed.
+        embedder: the network.
+        n_frames: of each clip.
+        on_done: called after each clip.
+
+    Returns:
+        (n, D) float32 per clip.
+    """
+    vectors = []
+    for clip in clips:
+        parts = sorted(clip.path.iterdir()) if clip.path.is_dir() else [clip.path]
+        content = [artifacts.hash_file(path) for path in parts if path.is_file()]
+        digest = artifacts.hash_json([content, embedder.fingerprint, n_frames])
+        path = artifacts.cache_dir() / "clips" / f"{digest[:20]}.npz"
+        cached = read_arrays(path)
+        if cached is None:
+            with one_thread():
+                cached = {"embeddings": embedder.embed_images(read_clip(clip.path, n_frames))}
+            write_arrays(path, cached)
+        vectors.append(np.asarray(cached["embeddings"], dtype=np.float32))
+        on_done()
+    return vectors
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Frames of clips, as candidates of a selection."""
+
+    embeddings: FloatArray
+    """(M, D)."""
+    starts: FloatArray
+    """(M, D) x_0 of each."""
+    clip: NDArray[np.intp]
+    """(M,) which clip each is of."""
+    satisfies: NDArray[np.bool_]
+    """(M,) which reach the goal."""
+
+
+def candidates(
+    clips: Sequence[Clip], embeddings: Sequence[FloatArray], goal: int, *, diverse: bool, same_context: bool, seed: int
+) -> Frames:
+    """Take the frames of all clips but the one that specifies the goal.
+
+    Args:
+        clips: all of them.
+        embeddings: (n, D) of each.
+        goal: which clip specifies the goal; it is no candidate.
+        diverse: candidates of all objects, not of the goal's alone.
+        same_context: x_0 of a candidate's own clip, else of another candidate clip drawn with `seed`.
+        seed: of that draw.
+
+    Raises:
+        BadInput: there are fewer than 2 clips to choose from.
+    """
+    pool = [i for i, clip in enumerate(clips) if i != goal and (diverse or clip.thing == clips[goal].thing)]
+    if len(pool) < 2:
+        raise BadInput(f"at least 3 clips of {clips[goal].thing!r} are needed, one for the goal and two to choose from")
+    contexts = np.arange(len(pool))
+    if not same_context:
+        contexts = (contexts + np.random.default_rng(seed).integers(1, len(pool), size=len(pool))) % len(pool)
+    lengths = [len(embeddings[i]) for i in pool]
+    reached = [
+        (np.arange(n) >= n - max(1, round(GOAL_SHARE * n))) & (clips[i].thing == clips[goal].thing)
+        for i, n in zip(pool, lengths, strict=True)
+    ]
+    return Frames(
+        np.concatenate([embeddings[i][1:] for i in pool]),
+        np.concatenate(
+            [np.repeat(embeddings[pool[c]][:1], n - 1, axis=0) for c, n in zip(contexts, lengths, strict=True)]
+        ),
+        np.repeat(pool, np.array(lengths) - 1),
+        np.concatenate([one[1:] for one in reached]),
+    )
