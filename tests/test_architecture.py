@@ -19,17 +19,17 @@ ORDER = (
     "load_order", "errors", "types", "artifacts", "parallel", "tasks", "data", "data_writer", "metrics", "quality",
     "envs", "arm", "experts", "collect",
     "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "looks", "selection",
-    "footage", "relabel", "agents",
+    "footage", "relabel", "export", "agents",
     "checkpoints", "training", "evaluation", "report", "panels", "comparison", "inspection",
     "inspection_page", "candidates",
     "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.inspect", "cli.select_footage",
-    "cli.select", "cli.train", "cli.evaluate", "cli.report", "cli.plans", "cli.studies",
+    "cli.select", "cli.export", "cli.train", "cli.evaluate", "cli.report", "cli.plans", "cli.studies",
     "cli.reproduce",
 )  # fmt: skip
 """The pipeline: a module imports only what stands before it. A folder is listed once, its files share the place."""
 
-MAY_READ_GROUND_TRUTH = ("data", "panels", "comparison", "inspection")
-"""`read_ground_truth` and its only callers, which make reports: nothing that chooses or trains anything."""
+MAY_READ_GROUND_TRUTH = ("data", "panels", "comparison", "inspection", "export")
+"""`read_ground_truth` and its only callers, which make reports or copies: nothing that chooses or trains anything."""
 
 HEAVY = ("torch", "transformers", "mujoco", "minari", "timm", "open_clip", "gymnasium", "matplotlib", "scipy", "h5py")
 
