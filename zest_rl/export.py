@@ -78,7 +78,8 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
 
     Returns:
         observations, next_observations (T, obs_dim), actions (T, act_dim), rewards (T,) float32; terminals, timeouts
-        (T,) bool; and where they are recorded, zest_score, gt_reward (T,) float32 after the action, gt_success (T,) bool.
+        (T,) bool; and where they are recorded, zest_score, gt_reward (T,) float32 after the action, gt_success (T,)
+        bool.
 
     Raises:
         BadInput: no such dataset, or the rewards cannot be normalised.
