@@ -135,6 +135,6 @@ def test_what_cannot_be_selected_from_is_refused(collected: str, capsys: pytest.
         draw_candidates([], 5)
     with pytest.raises(BadInput, match="each once"):
         draw_candidates([collected, collected], 5)
-    for wrong in ("--top", "--n-repeats"):
+    for wrong in ("--top", "--n-repeats", "--n-frames", "--views"):
         assert cli.main(["select", "goals", collected, wrong, "0"]) == 2
         assert "must be at least 1" in capsys.readouterr().err

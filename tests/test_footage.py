@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import imageio.v2 as imageio
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
 
+from zest_rl import cli
 from zest_rl.embedders import load_embedder
 from zest_rl.envs import KitchenEnv
 from zest_rl.errors import BadInput
@@ -23,6 +26,7 @@ from zest_rl.footage import (
     Clip,
     candidates,
     embed_clips,
+    enough,
     folder_of_clips,
     read_clip,
     something_something,
@@ -64,9 +68,10 @@ def root(openings: dict[str, list[list[np.ndarray]]], tmp_path: Path, monkeypatc
             labels.append({"id": name, "template": OPENING, "placeholders": [f"a kitchen {thing}"]})
     labels.append({"id": "1", "template": "Closing [something]", "placeholders": ["oven"]})
     labels.append({"id": "2", "template": OPENING, "placeholders": ["a bottle"]})
+    labels.append({"id": "1000", "template": OPENING, "placeholders": ["a drawerful"]})
     labels.append({"id": "3", "template": OPENING, "placeholders": ["oven"]})  # its video was not downloaded
-    (root / LABELS.replace("*", "train")).write_text(json.dumps(labels))
-    (root / LABELS.replace("*", "labels")).write_text(json.dumps({OPENING: "46"}))
+    (root / LABELS[0]).write_text(json.dumps(labels))
+    (root / "something-something-v2-labels.json").write_text(json.dumps({OPENING: "46"}))
     return root
 
 
@@ -99,6 +104,36 @@ def test_the_clips_of_one_action_on_the_objects_are_found(root: Path) -> None:
     assert [clip.thing for clip in something_something(root, things=("drawer",))] == ["drawer"] * 3
 
 
+@pytest.mark.parametrize("name", LABELS)
+def test_labels_are_found_where_any_release_has_them(root: Path, name: str) -> None:
+    (root / name).parent.mkdir(exist_ok=True)
+    (root / LABELS[0]).rename(root / name)
+    assert len(something_something(root)) == 6
+
+
+def test_a_video_of_changing_frame_rate_is_read_to_its_end(
+    openings: dict[str, list[list[np.ndarray]]], tmp_path: Path
+) -> None:
+    clip = openings["oven"][0]
+    slow, fast = tmp_path / "slow.mp4", tmp_path / "fast.mp4"
+    imageio.mimwrite(slow, clip[: N // 2], fps=2, quality=9)
+    imageio.mimwrite(fast, clip[N // 2 :], fps=30, quality=9)
+    (tmp_path / "parts.txt").write_text("file slow.mp4\nfile fast.mp4\n")
+    both = tmp_path / "both.mp4"
+    ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
+    words = [ffmpeg, "-loglevel", "error", "-f", "concat", "-i", tmp_path / "parts.txt", "-c", "copy", both]
+    subprocess.run(words, check=True)
+    last = read_clip(both, 5)[-1].astype(float)
+    errors = [np.abs(last - frame).mean() for frame in clip]
+    assert int(np.argmin(errors)) == N - 1
+
+
+def test_pictures_are_taken_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for i in range(12):
+        Image.new("RGB", (8, 8), (20 * i, 0, 0)).save(tmp_path / f"frame{i}.png")
+    assert [int(frame[0, 0, 0]) for frame in read_clip(tmp_path, 12)] == [20 * i for i in range(12)]
+
+
 def test_clips_are_embedded_once(root: Path) -> None:
     clips, embedder = something_something(root)[:2], load_embedder("efficientnet-lite0")
     done: list[None] = []
@@ -128,8 +163,9 @@ def test_candidates_are_the_frames_of_the_other_clips() -> None:
     assert (other.starts[:, 0] != 10 * other.clip).all()
     assert set(other.starts[:, 0] / 10) <= {0, 2, 3, 4}
     assert set(other.clip[other.satisfies]) == {0, 2}, "the end of another object is no goal"
-    with pytest.raises(BadInput, match="at least 3 clips of 'b' are needed"):
-        candidates(clips, embeddings, 3, diverse=False, same_context=True, seed=0)
+    elsewhere = candidates(clips, embeddings, 1, diverse=False, same_context=False, seed=0)
+    np.testing.assert_array_equal(elsewhere.starts[:, 0], 20 - 10 * elsewhere.clip)  # of the other one of two
+    assert enough(clips) == ["a"]
 
 
 def test_the_verb_judges_the_frames_that_score_highest(root: Path, zest: Callable[..., dict[str, Any]]) -> None:
@@ -155,7 +191,25 @@ def test_the_verb_judges_the_frames_that_score_highest(root: Path, zest: Callabl
     assert narrow["objects"]["oven"]["top_n_success"]["value"] == pytest.approx(np.mean(shares))
     diverse = zest(*words, "--pool", "all", "--context", "different")
     assert diverse["mean"]["goal_frame_ratio"] == pytest.approx(4 / 55)
-    assert diverse["objects"] != narrow["objects"]
+    assert {row["top"] for row in diverse["objects"].values()} == {4}
+    assert diverse["settings"]["context"] == "different"
+    many = zest(*words[:-1], 25)
+    assert {row["top"] for row in many["objects"].values()} == {4}, "two clips, of which two frames each reach the goal"
+
+
+def test_an_object_with_few_clips_is_left_out_and_named(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (root / VIDEOS / "1005.webm").unlink()
+    words = ["select", "footage", str(root), "--layout", "something-something", "--n-frames", "4", "--top", "1"]
+    assert cli.main(words) == 0
+    out, err = capsys.readouterr()
+    assert "'drawer' is left out: it has fewer than 3 clips" in err
+    assert "oven" in out
+    assert "drawer" not in out
+    (root / VIDEOS / "1000.webm").unlink()
+    assert cli.main(words) == 2
+    assert "no object in" in capsys.readouterr().err
+    assert cli.main([*words[:3], "--n-frames", "4"]) == 2
+    assert "give --layout something-something" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -163,9 +217,9 @@ def test_the_verb_judges_the_frames_that_score_highest(root: Path, zest: Callabl
     [
         (lambda root: (root / VIDEOS / "1000.webm").write_bytes(b"no video"), r"1000\.webm cannot be read as a video"),
         (lambda root: (root / VIDEOS / "1000.webm").write_bytes(b""), r"1000\.webm cannot be read as a video"),
-        (lambda root: (root / LABELS.replace("*", "train")).write_text("{"), "is not a list of labels"),
-        (lambda root: (root / LABELS.replace("*", "train")).write_text("[]"), "no clip is of 'Opening"),
-        (lambda root: (root / LABELS.replace("*", "train")).unlink(), "as Something-Something V2 does"),
+        (lambda root: (root / LABELS[0]).write_text("{"), "is not a list of labels"),
+        (lambda root: (root / LABELS[0]).write_text("[]"), "no clip is of 'Opening"),
+        (lambda root: (root / LABELS[0]).unlink(), "as Something-Something V2 does"),
     ],
 )
 def test_what_cannot_be_read_is_refused_by_name(root: Path, spoil: Callable[[Path], object], message: str) -> None:

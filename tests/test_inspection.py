@@ -205,6 +205,7 @@ def test_the_verb_prints_figures_warns_and_leaves_a_page(
     assert not any("shuffled?" in warning for warning in result["warnings"][scored])
     assert result["goals_against_tasks"] is None, "both are of one task"
     page = (tmp_path / "page.html").read_text()
+    assert page.count('class="strip"') == 2, "best and worst; the shuffled scores are not those of what is seen"
     for heading in ("Warnings", "Reward quality", "Ranking", "Frames", "Views", "Pixels", "Scores over time"):
         assert f"<h2>{heading}</h2>" in page
     json.dumps(result, allow_nan=False)

@@ -9,18 +9,23 @@ from zest_rl import data
 from zest_rl.frames import Views, canonical_states
 from zest_rl.looks import N_FRAMES, Look
 from zest_rl.scorer import Scorer, ScorerConfig
+from zest_rl.scores import Features
 
 VIEWS = Views("micro", n_views=2, size=96, tolerance=0.05)
 
 
-@pytest.mark.parametrize("goal", ["same-scene", "drawings"])
-def test_an_episode_is_shown_with_its_scores_by_view_and_its_change_in_pixels(collected: str, goal: str) -> None:
+@pytest.mark.parametrize(("goal", "features"), [("same-scene", "delta"), ("drawings", "raw"), ("drawings", "progress")])
+def test_an_episode_is_shown_with_its_scores_by_view_and_its_change_in_pixels(
+    collected: str, goal: str, features: Features
+) -> None:
     states = data.read_states(collected)[0]
-    scorer = Scorer.build(ScorerConfig(VIEWS, goal), states[0], n_workers=1)
+    scorer = Scorer.build(ScorerConfig(VIEWS, goal, features=features), states[0], n_workers=1)
     look = Look.at(scorer, states)
     np.testing.assert_allclose(look.scores, scorer.score_episodes([states])[0][0], atol=1e-6)
     assert look.by_view.shape == (2, len(states))
     assert not np.allclose(*look.by_view)
+    if features != "progress":
+        np.testing.assert_allclose(look.by_view.mean(axis=0), look.scores, atol=1e-5)
     assert len(look.frames) == len(look.steps) == N_FRAMES
     assert (look.steps[0], look.steps[-1]) == (0, len(states) - 1)
     with VIEWS.renderer() as renderer:

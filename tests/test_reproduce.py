@@ -259,6 +259,7 @@ def test_one_task_may_have_several_datasets(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [
+        ('goal = "same-scene"', 'goal = "same-scene"\ngoal_share = 7.0', "goal_share must be in"),
         ("[evaluate]", "[evalute]", "unknown key 'evalute'; did you mean 'evaluate'"),
         ('title = "A tiny comparison"', "", "'title' is required"),
         ("seeds = [0]", 'seeds = ["0"]', "'seeds' must be a list of an integer, got ['0']"),

@@ -58,7 +58,6 @@ def test_a_study_selects_in_every_cell_and_puts_the_paper_beside(
         "select", "goals", "zest/kitchen-micro-whole-v0", "--views", 1, "--tolerance", 0.05, "--n-frames", 60,
         "--top", 3, "--goal", "drawings", "--n-workers", 1,
     )  # fmt: skip
-    alone.pop("next", None)
     assert result["rows"][1]["tasks"]["micro"] == alone
     assert result["rows"][1]["mean"]["top_n_success"] == alone["top_n_success"]["value"]
     assert result["rows"][3]["tasks"] == result["rows"][1]["tasks"], "of one task, all tasks are the single one"
@@ -88,6 +87,9 @@ def test_a_study_selects_in_every_cell_and_puts_the_paper_beside(
             "at least 1 value",
         ),
         ("top = 3", 'task = "micro"', "'task' is not for a recipe to set"),
+        ("top = 3", 'similarity = "l2"\nfeatures = "progress"', "bring a similarity of their own"),
+        ("top = 3", "n-repeats = 0", "must be at least 1"),
+        ("{ micro = 92.0 }", "{}", "every row needs the figure of at least 1 task"),
     ],
 )
 def test_a_wrong_study_is_refused_before_anything_runs(tmp_path: Path, old: str, new: str, message: str) -> None:

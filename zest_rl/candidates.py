@@ -14,6 +14,7 @@ from zest_rl.envs import progress_of
 from zest_rl.errors import BadInput, nearest
 from zest_rl.frames import Views, canonical_states
 from zest_rl.scorer import Scorer, ScorerConfig
+from zest_rl.selection import others
 from zest_rl.tasks import SUCCESS_PROGRESS, TASKS, Task, get_task
 
 Context = Literal["same", "different"]
@@ -61,9 +62,7 @@ class Candidates:
             raise BadInput(f"unknown context {context!r}; {nearest(context, ('same', 'different'))}")
         if len(self.starts) < 2:
             raise BadInput("a different trajectory to take x_0 from needs at least 2 trajectories, got 1")
-        shift = np.random.default_rng(seed).integers(1, len(self.starts), size=len(self.starts))
-        others = (np.arange(len(self.starts)) + shift) % len(self.starts)  # never itself
-        return np.asarray(self.starts[others[self.trajectory]])
+        return np.asarray(self.starts[others(len(self.starts), seed)[self.trajectory]])
 
 
 def draw_candidates(dataset_ids: Sequence[str], n_frames: int, seed: int = 0) -> Candidates:

@@ -3,11 +3,10 @@
 Transition t of an episode is (o_t, a_t, r_t, o_{t+1}); nothing is shifted and nothing is lost. Ground truth and scores
 go along under names of their own, and are never the reward unless the dataset's rewards are them.
 
-=============  ======================================================================================================
-``npz``        flat arrays (N, …) of all transitions, in the order of episodes, which `episode` tells apart
-``d4rl``       the same names at the root of an HDF5 file, as D4RL's datasets and CORL's flat loaders read them
-``robomimic``  ``data/demo_I`` per episode with ``obs/flat`` and ``next_obs/flat``, and masks ``train`` and ``valid``
-=============  ======================================================================================================
+- ``npz``: flat arrays (N, …) of all transitions, in the order of episodes, which `episode` tells apart.
+- ``d4rl``: the same names at the root of an HDF5 file, as ``d4rl.qlearning_dataset(env, dataset=…)`` reads them; that
+  function leaves out the last transition of every episode that a time limit ended.
+- ``robomimic``: ``data/demo_I`` per episode with ``obs/flat`` and ``next_obs/flat``, and masks ``train`` and ``valid``.
 """
 
 from __future__ import annotations
@@ -37,31 +36,37 @@ class Rewards:
     """How the dataset's rewards are handed on."""
 
     shape: Shape = "step"
-    """``step``: as they are; ``difference``: their change, the first against 0; ``terminal``: the last one alone."""
+    """``step``: as they are; ``difference``: their change; ``terminal``: the last one alone, 0 before."""
     normalise: bool = False
-    """Shift and scale to [0, 1] over the dataset, after the shape was made."""
+    """Shift and scale to [0, 1] over the dataset, after the shape was made; of ``terminal`` the last ones alone."""
 
     def __post_init__(self) -> None:
         if self.shape not in get_args(Shape):
             raise BadInput(f"unknown shape of rewards {self.shape!r}; {nearest(self.shape, get_args(Shape))}")
 
-    def of(self, episodes: list[FloatArray]) -> list[FloatArray]:
-        """Shape and scale the rewards (T,) of all episodes.
+    def of(self, episodes: list[FloatArray], before: list[float]) -> list[FloatArray]:
+        """Shape and scale the rewards of all episodes.
+
+        Args:
+            episodes: (T,) float32 each.
+            before: what the frame before the first action is worth, which the first difference is against.
 
         Raises:
             BadInput: rewards that are all equal are to be normalised.
         """
         if self.shape == "difference":
-            episodes = [np.diff(rewards, prepend=np.float32(0)) for rewards in episodes]
-        elif self.shape == "terminal":
-            episodes = [np.where(np.arange(len(r)) == len(r) - 1, r, np.float32(0)) for r in episodes]
-        if not self.normalise:
-            return episodes
-        every = np.concatenate(episodes)
-        low, size = every.min(), np.ptp(every)
-        if size == 0:
-            raise BadInput("rewards that are all equal cannot be normalised; leave --normalise out")
-        return [((rewards - low) / size).astype(np.float32) for rewards in episodes]
+            episodes = [np.diff(one, prepend=np.float32(first)) for one, first in zip(episodes, before, strict=True)]
+        counted = [rewards[-1:] if self.shape == "terminal" else rewards for rewards in episodes]
+        if self.normalise:
+            every = np.concatenate(counted)
+            low, size = every.min(), np.ptp(every)
+            if size == 0:
+                raise BadInput("rewards that are all equal cannot be normalised; leave --normalise out")
+            counted = [((rewards - low) / size).astype(np.float32) for rewards in counted]
+        return [
+            np.concatenate([np.zeros(len(rewards) - len(own), np.float32), own])
+            for rewards, own in zip(episodes, counted, strict=True)
+        ]
 
 
 Transitions = dict[str, NDArray[Any]]
@@ -78,22 +83,29 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
 
     Returns:
         observations, next_observations (T, obs_dim), actions (T, act_dim), rewards (T,) float32; terminals, timeouts
-        (T,) bool; and where they are recorded, zest_score, gt_reward (T,) float32 after the action, gt_success (T,)
-        bool.
+        (T,) bool; and where they are recorded, zest_score, gt_reward (T,) float32 after the action, and
+        gt_episode_success (T,) bool, of the whole episode.
 
     Raises:
-        BadInput: no such dataset, or the rewards cannot be normalised.
+        BadInput: no such dataset, the rewards cannot be normalised, or are differences already.
     """
     episodes = data.read_episodes(dataset_id)
+    made = data.read_metadata(dataset_id).get("zest", {}).get("relabel")
+    before = [0.0] * len(episodes)
+    if made is not None:
+        if rewards.shape == "difference" and made["reward"] == "difference":
+            raise BadInput(f"the rewards of {dataset_id} are differences already; export them as they are")
+        before = [float(score[0]) for score in data.read_scores(dataset_id)]
     extras: dict[str, list[NDArray[Any]]] = {}
-    if "relabel" in data.read_metadata(dataset_id).get("zest", {}):
+    if made is not None:
         extras["zest_score"] = [score[1:] for score in data.read_scores(dataset_id)]
     if data.has_ground_truth(dataset_id):
         truth = data.read_ground_truth(dataset_id)
         extras["gt_reward"] = [episode.rewards for episode in truth]
-        extras["gt_success"] = [np.full(len(episode.rewards), episode.success) for episode in truth]
+        extras["gt_episode_success"] = [np.full(len(episode.rewards), episode.success) for episode in truth]
+    shaped = rewards.of([episode.rewards for episode in episodes], before)
     found = []
-    for i, (episode, own) in enumerate(zip(episodes, rewards.of([e.rewards for e in episodes]), strict=True)):
+    for i, (episode, own) in enumerate(zip(episodes, shaped, strict=True)):
         last = np.arange(len(episode)) == len(episode) - 1
         found.append(
             {
@@ -109,7 +121,18 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
     return found
 
 
-def export(dataset_id: str, to: Format, path: Path, rewards: Rewards = AS_RECORDED) -> Path:
+@dataclass(frozen=True)
+class Exported:
+    """What `export` wrote."""
+
+    path: Path
+    n_episodes: int
+    n_transitions: int
+    arrays: tuple[str, ...]
+    """Names of the arrays of `transitions`."""
+
+
+def export(dataset_id: str, to: Format, path: Path, rewards: Rewards = AS_RECORDED) -> Exported:
     """Write a dataset in another format, atomically.
 
     Args:
@@ -119,7 +142,7 @@ def export(dataset_id: str, to: Format, path: Path, rewards: Rewards = AS_RECORD
         rewards: how the dataset's rewards are handed on.
 
     Raises:
-        BadInput: no such dataset, an unknown format, or there is a file already.
+        BadInput: no such dataset, an unknown format, there is a file already, or the format would lose the rewards.
         ZestError: the disk is full or read-only.
     """
     if to not in WRITERS:
@@ -127,23 +150,28 @@ def export(dataset_id: str, to: Format, path: Path, rewards: Rewards = AS_RECORD
     if path.exists():
         raise BadInput(f"{path} exists; delete it, or choose another --output")
     episodes = transitions(dataset_id, rewards)
+    if to == "d4rl" and rewards.shape == "terminal" and any(episode["timeouts"].any() for episode in episodes):
+        raise BadInput(
+            "D4RL's loader leaves out the transition at a time limit, which holds the only reward of 'terminal'; "
+            "export 'step' or 'difference', or to npz"
+        )
     size = sum(array.nbytes for episode in episodes for array in episode.values())
     artifacts.check_free_space(path.parent, 2 * size)
     with artifacts.atomic_path(path) as temporary:
         WRITERS[to](temporary, episodes, _about(dataset_id, rewards))
-    return path
+    return Exported(path, len(episodes), sum(len(episode["rewards"]) for episode in episodes), tuple(episodes[0]))
 
 
 def _about(dataset_id: str, rewards: Rewards) -> dict[str, Any]:
     """What a reader of the file may want to know of where it comes from."""
-    described = data.describe(dataset_id)
+    metadata = data.read_metadata(dataset_id)
     return {
         "dataset": dataset_id,
         "rewards": rewards.shape + (", normalised" if rewards.normalise else ""),
-        "env_spec": json.loads(described["env_spec"]),
-        "ref_min_score": described["ref_min_score"],
-        "ref_max_score": described["ref_max_score"],
-        "zest": described["zest"],
+        "env_spec": json.loads(metadata.get("env_spec") or "null"),
+        "ref_min_score": metadata.get("ref_min_score"),
+        "ref_max_score": metadata.get("ref_max_score"),
+        "zest": metadata.get("zest"),
     }
 
 
@@ -166,6 +194,8 @@ def _write_d4rl(path: Path, episodes: list[Transitions], about: dict[str, Any]) 
 
 
 def _write_robomimic(path: Path, episodes: list[Transitions], about: dict[str, Any]) -> None:
+    if len(episodes) < 2:
+        raise BadInput("robomimic's masks part the episodes into train and valid, which takes 2 or more; got 1")
     names = [f"demo_{i}" for i in range(len(episodes))]
     with h5py.File(path, "w") as file:
         group = file.create_group("data")
@@ -177,11 +207,10 @@ def _write_robomimic(path: Path, episodes: list[Transitions], about: dict[str, A
             for key in ("actions", "rewards"):
                 demo.create_dataset(key, data=episode[key])
             demo.create_dataset("dones", data=(episode["terminals"] | episode["timeouts"]).astype(np.int64))
-            for key in ("zest_score", "gt_reward", "gt_success"):
-                if key in episode:
-                    demo.create_dataset(key, data=episode[key])
+            for key in sorted(episode.keys() - {"observations", "next_observations", "actions", "rewards"}):
+                demo.create_dataset(key, data=episode[key])
         group.attrs["total"] = sum(len(episode["rewards"]) for episode in episodes)
-        spec = about["env_spec"]
+        spec = about["env_spec"] or {"id": "unknown"}
         env = {"env_name": spec["id"], "type": 2, "env_kwargs": spec.get("kwargs", {})}  # 2: a Gym environment
         group.attrs["env_args"] = json.dumps(env)
         group.attrs["about"] = json.dumps(about)

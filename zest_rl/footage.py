@@ -8,7 +8,8 @@ its last `GOAL_SHARE` of frames count as reaching the goal of the same object. T
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,14 +22,24 @@ from zest_rl import artifacts
 from zest_rl.embedders import Embedder
 from zest_rl.errors import BadInput, nearest
 from zest_rl.images import list_images, read_image
+from zest_rl.metrics import Values
 from zest_rl.parallel import one_thread, read_arrays, write_arrays
+from zest_rl.scores import Features, Similarity, score_views
+from zest_rl.selection import others
 from zest_rl.types import FloatArray, Frame
 
 OPENING = "Opening [something]"
 OBJECTS = ("door", "drawer", "box", "fridge", "laptop", "washing machine", "oven")
 """The seven objects of the paper."""
 GOAL_SHARE = 0.2
-VIDEOS, LABELS = "20bn-something-something-v2", "something-something-v2-*.json"
+VIDEOS = "20bn-something-something-v2"
+LABELS = tuple(
+    f"{folder}{prefix}{part}.json"
+    for folder in ("", "labels/")
+    for prefix in ("something-something-v2-", "")
+    for part in ("train", "validation")
+)
+"""Where the labels of its releases stand."""
 VIDEO_SUFFIXES = (".avi", ".mkv", ".mov", ".mp4", ".webm")
 
 
@@ -58,22 +69,34 @@ def read_clip(path: Path, n_frames: int) -> list[Frame]:
     if n_frames < 2:
         raise BadInput(f"a clip needs at least 2 frames, its first and its last, got {n_frames}")
     if path.is_dir():
-        pictures = list_images(path)
+        pictures = sorted(list_images(path), key=_by_number)
         frames = [read_image(pictures[i]) for i in _even(len(pictures), n_frames)]
     elif not path.is_file():
         raise BadInput(f"{path} is not a file; give a video or a folder of pictures")
     else:
         try:
-            with imageio.get_reader(path, "ffmpeg") as video:
-                reader: Any = video
-                wanted = set(_even(reader.count_frames(), n_frames).tolist())
-                frames = [np.asarray(frame) for i, frame in enumerate(reader.iter_data()) if i in wanted]
+            n = sum(1 for _ in _decoded(path))  # what the file says of its length may not be what is decoded
+            wanted = set(_even(n, n_frames).tolist())
+            frames = [frame for i, frame in enumerate(_decoded(path)) if i in wanted]
         except (OSError, RuntimeError, ValueError, IndexError) as error:
             reason = " ".join(str(error).split())[:200]
             raise BadInput(f"{path} cannot be read as a video ({reason}); copy it, or convert it to MP4") from error
     if len(frames) < 2:
         raise BadInput(f"{path} has {len(frames)} frames, at least 2 are needed; remove it")
     return frames
+
+
+def _by_number(path: Path) -> list[int | str]:
+    """Order frame2 before frame10."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
+
+
+def _decoded(path: Path) -> Iterator[Frame]:
+    as_stored = ["-fps_mode", "passthrough"]  # else frames are repeated or dropped to a constant rate
+    with imageio.get_reader(path, "ffmpeg", output_params=as_stored) as video:
+        reader: Any = video
+        for frame in reader.iter_data():
+            yield np.asarray(frame, dtype=np.uint8)
 
 
 def _even(n: int, n_wanted: int) -> NDArray[np.intp]:
@@ -83,17 +106,15 @@ def _even(n: int, n_wanted: int) -> NDArray[np.intp]:
 def something_something(root: Path, things: Sequence[str] = OBJECTS, template: str = OPENING) -> list[Clip]:
     """Find the clips of one action on some objects in a folder laid out as Something-Something V2.
 
-    The folder holds ``20bn-something-something-v2/ID.webm`` and ``something-something-v2-train.json`` (or
-    ``-validation``), a list of ``{"id", "template", "placeholders"}``. A clip is of an object when its first
-    placeholder ends with it: "a kitchen drawer" is a drawer.
+    The folder holds ``20bn-something-something-v2/ID.webm`` and one of `LABELS`, lists of ``{"id", "template",
+    "placeholders"}``. A clip is of an object when its first placeholder ends with it: "a kitchen drawer" is a drawer.
 
     Raises:
         BadInput: the layout is another one, or no clip is found.
     """
-    files = sorted(root.glob(LABELS)) if root.is_dir() else []
-    files = [path for path in files if not path.name.endswith(("labels.json", "test.json"))]
+    files = [root / name for name in LABELS if (root / name).is_file()]
     if not files or not (root / VIDEOS).is_dir():
-        raise BadInput(f"{root} must hold {VIDEOS}/ and {LABELS.replace('*', 'train')}, as Something-Something V2 does")
+        raise BadInput(f"{root} must hold {VIDEOS}/ and {LABELS[0]} (or {LABELS[-2]}), as Something-Something V2 does")
     clips, templates = [], set()
     for file in files:
         try:
@@ -101,8 +122,8 @@ def something_something(root: Path, things: Sequence[str] = OBJECTS, template: s
             for entry in entries:
                 templates.add(entry["template"])
                 if entry["template"] == template:
-                    words = str(entry["placeholders"][0]).lower()
-                    thing = next((thing for thing in things if words.endswith(thing)), None)
+                    words = str(entry["placeholders"][0]).lower().strip()
+                    thing = next((one for one in things if re.search(rf"\b{re.escape(one)}s?$", words)), None)
                     path = root / VIDEOS / f"{entry['id']}.webm"
                     if thing is not None and path.is_file():
                         clips.append(Clip(path, thing))
@@ -121,16 +142,22 @@ def folder_of_clips(root: Path) -> list[Clip]:
     Raises:
         BadInput: there is none.
     """
+    if (root / VIDEOS).exists():
+        raise BadInput(f"{root} is laid out as Something-Something V2; give --layout something-something")
     clips = [
         Clip(path, thing.name)
-        for thing in (sorted(root.iterdir()) if root.is_dir() else [])
-        if thing.is_dir() and not thing.name.startswith(".")
-        for path in sorted(thing.iterdir())
+        for thing in _visible(root)
+        if thing.is_dir()
+        for path in _visible(thing)
         if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES
     ]
     if not clips:
         raise BadInput(f"{root} must hold a folder per object with videos, or folders of pictures, in it")
     return clips
+
+
+def _visible(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if not path.name.startswith(".")) if folder.is_dir() else []
 
 
 def embed_clips(
@@ -176,6 +203,21 @@ class Frames:
     satisfies: NDArray[np.bool_]
     """(M,) which reach the goal."""
 
+    def scores(self, start: FloatArray, goal: FloatArray, features: Features, similarity: Similarity) -> Values:
+        """Score by one start and one goal, (1, D) each: (M,) float64."""
+        scores = np.empty(len(self.embeddings))
+        for clip in np.unique(self.clip):  # frames of one clip share x_0
+            members = np.flatnonzero(self.clip == clip)
+            frames = np.concatenate([self.starts[members[:1]], self.embeddings[members]])[:, None]
+            scores[members] = score_views(frames, start, goal, features, similarity)[1:]
+        return scores
+
+
+def enough(clips: Sequence[Clip]) -> list[str]:
+    """Return the objects with the 3 clips that a selection takes: one for the goal and two to choose from."""
+    things = dict.fromkeys(clip.thing for clip in clips)
+    return [thing for thing in things if sum(clip.thing == thing for clip in clips) >= 3]
+
 
 def candidates(
     clips: Sequence[Clip], embeddings: Sequence[FloatArray], goal: int, *, diverse: bool, same_context: bool, seed: int
@@ -183,32 +225,24 @@ def candidates(
     """Take the frames of all clips but the one that specifies the goal.
 
     Args:
-        clips: all of them.
+        clips: all of them, at least 3 of the goal's object.
         embeddings: (n, D) of each.
         goal: which clip specifies the goal; it is no candidate.
         diverse: candidates of all objects, not of the goal's alone.
         same_context: x_0 of a candidate's own clip, else of another candidate clip drawn with `seed`.
         seed: of that draw.
-
-    Raises:
-        BadInput: there are fewer than 2 clips to choose from.
     """
     pool = [i for i, clip in enumerate(clips) if i != goal and (diverse or clip.thing == clips[goal].thing)]
-    if len(pool) < 2:
-        raise BadInput(f"at least 3 clips of {clips[goal].thing!r} are needed, one for the goal and two to choose from")
-    contexts = np.arange(len(pool))
-    if not same_context:
-        contexts = (contexts + np.random.default_rng(seed).integers(1, len(pool), size=len(pool))) % len(pool)
+    contexts = np.arange(len(pool)) if same_context else others(len(pool), seed)
     lengths = [len(embeddings[i]) for i in pool]
     reached = [
         (np.arange(n) >= n - max(1, round(GOAL_SHARE * n))) & (clips[i].thing == clips[goal].thing)
         for i, n in zip(pool, lengths, strict=True)
     ]
+    starts = [embeddings[pool[context]][:1] for context in contexts]
     return Frames(
         np.concatenate([embeddings[i][1:] for i in pool]),
-        np.concatenate(
-            [np.repeat(embeddings[pool[c]][:1], n - 1, axis=0) for c, n in zip(contexts, lengths, strict=True)]
-        ),
+        np.concatenate([np.repeat(start, n - 1, axis=0) for start, n in zip(starts, lengths, strict=True)]),
         np.repeat(pool, np.array(lengths) - 1),
         np.concatenate([one[1:] for one in reached]),
     )

@@ -91,9 +91,9 @@ FIGURES = (
     ),
     Figure(
         "EPIC distance",
-        "to the true reward, step by step; 0 is the same up to scale and offset, .71 unrelated",
+        "of levels to the true reward, step by step; 0 is the same up to scale and offset, .71 unrelated",
         True,
-        lambda r: quality.epic_distance(r.rewards, [e.rewards for e in r.known_truth]),
+        lambda r: quality.epic_distance(r.scores, [e.rewards for e in r.known_truth]),
     ),
     Figure(
         "Value-order correlation",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from zest_rl import data
-from zest_rl.inspection import FIGURES, Inspection
+from zest_rl.inspection import FIGURES, MIN_EPISODES, Inspection
 from zest_rl.looks import Look
 from zest_rl.metrics import Estimate, spearman
 from zest_rl.panels import goal_panel, goal_scatter
@@ -95,7 +95,7 @@ def confusion_warnings(inspections: Sequence[Inspection], means: FloatArray) -> 
 
 
 def look_at(inspection: Inspection, *, n_workers: int | None = None) -> dict[str, Look]:
-    """Look at the episodes with the highest and the lowest return: "best" and "worst".
+    """Look at the episodes with the highest and the lowest return: "best" and "worst"; none where scores were shuffled.
 
     Args:
         inspection: of a dataset.
@@ -104,6 +104,8 @@ def look_at(inspection: Inspection, *, n_workers: int | None = None) -> dict[str
     Raises:
         ZestError: the scorer is gone, or was made with another embedder or renderer than the ones here.
     """
+    if inspection.made["shuffle"] is not None:
+        return {}
     scorer = Scorer.load(data.dataset_path(inspection.dataset_id) / SCORER_FILE, n_workers=n_workers)
     returns = [episode.rewards.sum(dtype=np.float64) for episode in data.read_episodes(inspection.dataset_id)]
     states = data.read_states(inspection.dataset_id)
@@ -127,22 +129,15 @@ def _strips(name: str, dataset_id: str, looks: Mapping[str, Look]) -> list[Strip
 def _views(name: str, look: Look) -> list[Curve]:
     steps = np.arange(len(look.scores), dtype=np.float32)
     by_view = [(f"view {view}", scores) for view, scores in enumerate(look.by_view, 1)]
-    return [Curve(view, f"{name}: score", steps, scores) for view, scores in [("mean", look.scores), *by_view]]
+    return [Curve(view, f"{name}: score", steps, scores) for view, scores in [("all views", look.scores), *by_view]]
 
 
 def _pixels(name: str, look: Look) -> Scatter:
     changed, scores = look.pixel_difference[1:], look.scores[1:]
-    rho = spearman(changed.astype(np.float64), scores.astype(np.float64))
-    return Scatter(
-        name,
-        scores,
-        changed,
-        rho.value,
-        (rho.low, rho.high),
-        upward="ZeST score",
-        across="mean pixel difference",
-        point="step",
-    )
+    rho = float("nan")
+    if len(scores) >= MIN_EPISODES:  # the interval of steps that follow each other would be far too narrow
+        rho = spearman(changed.astype(np.float64), scores.astype(np.float64), n_resamples=1).value
+    return Scatter(name, scores, changed, rho, upward="ZeST score", across="mean pixel difference", point="step")
 
 
 def inspection_report(
@@ -173,7 +168,7 @@ def inspection_report(
         for name, one in zip(names, inspections, strict=True)
         for group, mean in one.over_time.items()
     ]
-    seen = {one.dataset_id: name for name, one in zip(names, inspections, strict=True) if one.dataset_id in looks}
+    seen = {one.dataset_id: name for name, one in zip(names, inspections, strict=True) if looks.get(one.dataset_id)}
     n_warnings = sum(map(len, warnings.values()))
     return Report(
         title="What these rewards are worth",

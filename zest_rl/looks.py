@@ -25,7 +25,7 @@ class Look:
     steps: NDArray[np.intp]
     """(n,) which steps they are."""
     scores: FloatArray
-    """(T+1,), averaged over views."""
+    """(T+1,) of all views together."""
     by_view: FloatArray
     """(V, T+1), each view's own."""
     pixel_difference: FloatArray
@@ -46,11 +46,10 @@ class Look:
         first = frames[inverse[0]].astype(np.int16)
         difference = np.array([np.abs(frame - first).mean() for frame in frames], dtype=np.float32)
         steps = np.unique(np.linspace(0, len(states) - 1, N_FRAMES).round().astype(np.intp))
-        by_view = scorer.score_by_view(states)
         return cls(
             frames=frames[inverse[steps], frames.shape[1] // 2],
             steps=steps,
-            scores=by_view.mean(axis=0),
-            by_view=by_view,
+            scores=scorer.score_episodes([states])[0][0],
+            by_view=scorer.score_by_view(states),
             pixel_difference=difference[inverse],
         )

@@ -129,7 +129,7 @@ class Scorer:
         return scores, n_still
 
     def score_by_view(self, states: NDArray[np.float64]) -> FloatArray:
-        """Score one episode by each view alone: (T+1, nq) → (V, T+1) float32; their mean is the score."""
+        """Score one episode by each view alone: (T+1, nq) → (V, T+1) float32."""
         ((frames, inverse),) = self._frames([states], None)
         rows = []
         for view in range(frames.shape[1]):

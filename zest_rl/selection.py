@@ -90,6 +90,11 @@ def relative_variation(scores: Values, satisfies: NDArray[np.bool_]) -> float:
     return dataset_total_variation(scores, satisfies) * len(np.asarray(scores)) / 2
 
 
+def others(n: int, seed: int) -> NDArray[np.intp]:
+    """Draw for each of n >= 2 trajectories another one, never itself: (n,)."""
+    return (np.arange(n) + np.random.default_rng(seed).integers(1, n, size=n)) % n
+
+
 def over_trajectories(
     measure: Measure,
     scores: Values,

@@ -27,7 +27,8 @@ class Config:
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
     """Minari dataset, relabeled or not."""
     to: Literal["npz", "d4rl", "robomimic"] = "npz"
-    """Flat arrays, D4RL's HDF5 (also for CORL's loaders), or robomimic's HDF5."""
+    """Flat arrays; HDF5 for d4rl.qlearning_dataset(env, dataset=…), which leaves out the last transition before a time
+    limit; or robomimic's HDF5 (config: low_dim ["flat"], experiment.rollout.enabled false)."""
     output: Path | None = None
     """The file; default DATASET.npz or DATASET.FORMAT.hdf5 here."""
     shape: Literal["step", "difference", "terminal"] = "step"
@@ -38,18 +39,16 @@ class Config:
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Read, shape, write."""
-    from zest_rl.export import Rewards, export, transitions
+    from zest_rl.export import Rewards, export
 
     name = config.dataset.split("/")[-1]
     default = f"{name}.npz" if config.to == "npz" else f"{name}.{config.to}.{SUFFIXES[config.to]}"
-    rewards = Rewards(config.shape, config.normalise)
-    path = export(config.dataset, config.to, config.output or Path(default), rewards)
-    episodes = transitions(config.dataset, rewards)
+    written = export(config.dataset, config.to, config.output or Path(default), Rewards(config.shape, config.normalise))
     return {
-        "file": str(path),
-        "n_episodes": len(episodes),
-        "n_transitions": sum(len(episode["rewards"]) for episode in episodes),
-        "arrays": sorted(episodes[0]),
-        "bytes": path.stat().st_size,
-        "next": NEXT[config.to].format(path=path),
+        "file": str(written.path),
+        "n_episodes": written.n_episodes,
+        "n_transitions": written.n_transitions,
+        "arrays": sorted(written.arrays),
+        "bytes": written.path.stat().st_size,
+        "next": NEXT[config.to].format(path=written.path),
     }

@@ -8,7 +8,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from zest_rl.cli.ui import Ui, progress_in_parts
-from zest_rl.scores import Features, Similarity
+from zest_rl.errors import BadInput
+from zest_rl.scores import Features, Similarity, check_names
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,13 @@ class Config:
     """auto, cpu, cuda, cuda:1, …"""
     n_workers: int | None = None
     """Processes; default one per core."""
+
+    def __post_init__(self) -> None:
+        check_names(self.features, self.similarity)
+        if not 0 < self.goal_share <= 1:
+            raise BadInput(f"goal_share must be in (0, 1], got {self.goal_share}")
+        if self.views < 1:
+            raise BadInput(f"views must be at least 1, got {self.views}")
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:

@@ -14,7 +14,8 @@ import tyro
 
 from zest_rl.cli import select_footage
 from zest_rl.cli.ui import Ui, progress_in_parts
-from zest_rl.scores import Features, Similarity
+from zest_rl.errors import BadInput
+from zest_rl.scores import Features, Similarity, check_names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +57,14 @@ class Arguments:
     n_workers: int | None = None
     """Processes; default one per core."""
 
+    def __post_init__(self) -> None:
+        check_names(self.features, self.similarity)
+        if min(self.top, self.n_repeats, self.n_frames, self.views) < 1:
+            raise BadInput(
+                f"top, n_repeats, n_frames and views must be at least 1, got {self.top}, {self.n_repeats}, "
+                f"{self.n_frames} and {self.views}"
+            )
+
 
 @dataclass(frozen=True, kw_only=True)
 class GoalArguments(Arguments):
@@ -88,7 +97,6 @@ def run(config: Arguments | select_footage.FootageArguments, ui: Ui) -> dict[str
 
     from zest_rl import data, selection
     from zest_rl.candidates import draw_candidates, score_as_actions, score_as_goals
-    from zest_rl.errors import BadInput
     from zest_rl.frames import Views
     from zest_rl.scorer import ScorerConfig
     from zest_rl.tasks import get_task
@@ -96,8 +104,6 @@ def run(config: Arguments | select_footage.FootageArguments, ui: Ui) -> dict[str
     if not config.datasets:
         raise BadInput("`zest select` needs at least 1 dataset; `zest collect` makes them")
     task = get_task(config.task or data.task_name(config.datasets[0]))
-    if config.top < 1 or config.n_repeats < 1:
-        raise BadInput(f"--top and --n-repeats must be at least 1, got {config.top} and {config.n_repeats}")
     candidates = draw_candidates(config.datasets, config.n_frames, config.seed)
     satisfies = candidates.satisfies(task) if isinstance(config, GoalArguments) else candidates.does(task)
     if satisfies.sum() < config.top:

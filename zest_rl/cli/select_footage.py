@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import shlex
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -42,7 +43,7 @@ class FootageArguments:
     n_repeats: int = 10
     """Clips per object that specify the goal in turn."""
     max_clips: int | None = None
-    """Clips per object to use; default all."""
+    """Clips per object to use, at least 3; default all."""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """Of the embedder."""
     device: str = "auto"
@@ -57,68 +58,73 @@ def run(config: FootageArguments, ui: Ui) -> dict[str, Any]:
     from zest_rl.embedders import load_embedder
     from zest_rl.errors import BadInput
     from zest_rl.metrics import bootstrap
-    from zest_rl.scores import check_names, score_views
+    from zest_rl.scores import check_names
 
     check_names(config.features, config.similarity)
-    if min(config.top, config.n_repeats, config.max_clips or 1) < 1:
-        raise BadInput("--top, --n-repeats and --max-clips must be at least 1")
+    if min(config.top, config.n_repeats) < 1 or (config.max_clips is not None and config.max_clips < 3):
+        raise BadInput("--top and --n-repeats must be at least 1, and --max-clips at least 3")
     if config.layout == "by-object":
         found = footage.folder_of_clips(config.folder)
     else:
         found = footage.something_something(config.folder, template=config.template)
-    things = {thing: [clip for clip in found if clip.thing == thing][: config.max_clips] for thing in _things(found)}
-    clips = [clip for of_thing in things.values() for clip in of_thing]
+    things = footage.enough(found)
+    for thing in dict.fromkeys(clip.thing for clip in found if clip.thing not in things):
+        ui.warn(f"{thing!r} is left out: it has fewer than 3 clips, one for the goal and two to choose from")
+    if not things:
+        raise BadInput(f"no object in {config.folder} has the 3 clips that a selection takes")
+    by_thing = {thing: [clip for clip in found if clip.thing == thing][: config.max_clips] for thing in things}
+    clips = [clip for of_thing in by_thing.values() for clip in of_thing]
     embedder = load_embedder(config.embedder, device=config.device, precision=config.precision)
     with ui.progress("embedding clips", len(clips)) as advance:
         embeddings = footage.embed_clips(clips, embedder, config.n_frames, on_done=advance)
     rows: dict[str, dict[str, Any]] = {}
     for thing in things:
         own = [i for i, clip in enumerate(clips) if clip.thing == thing]
-        tops, ratios = [], []
-        for repeat, goal in enumerate(np.random.default_rng(0).permutation(own)[: config.n_repeats]):
+        tops, ratios, picked = [], [], []
+        for repeat, goal in enumerate(np.random.default_rng(0).permutation(own)[: config.n_repeats].tolist()):
             pool = footage.candidates(
-                clips, embeddings, int(goal), diverse=config.pool == "all",
-                same_context=config.context == "same", seed=repeat,
-            )  # fmt: skip
-            first, last = embeddings[goal][:1], embeddings[goal][-1:]
-            scores = np.empty(len(pool.embeddings))
-            for clip in np.unique(pool.clip):  # frames of one clip share x_0
-                members = np.flatnonzero(pool.clip == clip)
-                frames = np.concatenate([pool.starts[members[:1]], pool.embeddings[members]])[:, None]
-                scores[members] = score_views(frames, first, last, config.features, config.similarity)[1:]
+                clips,
+                embeddings,
+                goal,
+                diverse=config.pool == "all",
+                same_context=config.context == "same",
+                seed=repeat,
+            )
+            scores = pool.scores(embeddings[goal][:1], embeddings[goal][-1:], config.features, config.similarity)
             tops.append(selection.top_up_to(scores, pool.satisfies, config.top))
             ratios.append(selection.goal_frame_ratio(pool.satisfies))
+            picked.append(min(config.top, int(pool.satisfies.sum())))
         estimate = bootstrap([np.array(tops)])
         rows[thing] = {
             "top_n_success": {"value": estimate.value, "ci95": [estimate.low, estimate.high]},
             "goal_frame_ratio": float(np.mean(ratios)),
+            "top": min(picked),
             "n_clips": len(own),
             "n_goals": len(tops),
         }
+        if min(picked) < config.top:
+            ui.warn(f"{thing!r}: only {min(picked)} frames reach the goal, so the highest {min(picked)} are judged")
     mean = float(np.mean([row["top_n_success"]["value"] for row in rows.values()]))
     chance = float(np.mean([row["goal_frame_ratio"] for row in rows.values()]))
     return {
         "select": config.what,
-        "top": config.top,
+        "settings": {**asdict(config), "folder": str(config.folder), "embedder_sha256": embedder.fingerprint},
         "objects": rows,
         "mean": {"top_n_success": mean, "goal_frame_ratio": chance, "times_random": mean / chance},
         "n_clips": len(clips),
+        "next": f"zest select footage {shlex.quote(str(config.folder))} --pool all",
     }
-
-
-def _things(clips: list[Any]) -> list[str]:
-    return list(dict.fromkeys(clip.thing for clip in clips))
 
 
 def summary(result: dict[str, Any]) -> str:
     """One line per object, as text."""
-    lines = [f"Top-{result['top']} success on {result['n_clips']} clips{'':<12}at random"]
+    lines = [f"on {result['n_clips']} clips"]
     for thing, row in result["objects"].items():
         low, high = row["top_n_success"]["ci95"]
         lines.append(
-            f"  {thing:<18}{row['top_n_success']['value']:>7.1%}  [{low:.1%}, {high:.1%}]"
-            f"{row['goal_frame_ratio']:>12.1%}"
+            f"  {thing:<18}Top-{row['top']:<4}{row['top_n_success']['value']:>7.1%}  [{low:.1%}, {high:.1%}]"
+            f"   at random {row['goal_frame_ratio']:.1%}"
         )
     mean = result["mean"]
-    lines.append(f"  {'mean':<18}{mean['top_n_success']:>7.1%}  {mean['times_random']:.1f} times as good as random")
+    lines.append(f"  {'mean':<26}{mean['top_n_success']:>7.1%}  {mean['times_random']:.1f} times as good as random")
     return "\n".join(lines)

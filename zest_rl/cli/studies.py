@@ -48,6 +48,8 @@ class Study:
     def __post_init__(self) -> None:
         if not self.grid or not all(self.grid.values()):
             raise BadInput("grid needs at least 1 flag, and each flag at least 1 value")
+        if not all(self.paper.values()):
+            raise BadInput("paper: every row needs the figure of at least 1 task")
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,8 @@ def run(path: Path, output: Path, ui: Ui, *, n_workers: int | None = None) -> di
                 arguments = replace(setting.select, datasets=pool, task=config.task, n_workers=n_workers)
                 cells[name] = select.run(arguments, SilentUi())
                 advance()
-            rows.append({"name": setting.name, "setting": dict(setting.values), "tasks": cells, "mean": _mean(cells)})
+            about = {"name": setting.name, "setting": dict(setting.values), "pool": setting.pool}
+            rows.append({**about, "tasks": cells, "mean": _mean(cells)})
     result = {
         "study": plan.study.study,
         "title": plan.study.title,
@@ -139,7 +142,7 @@ def run(path: Path, output: Path, ui: Ui, *, n_workers: int | None = None) -> di
         "select": {
             flag.name: value for flag in fields(plan.settings[0].select)
             if (value := asdict(plan.settings[0].select)[flag.name]) is not None
-            and flag.name not in (*plan.study.grid, "datasets", "n_workers")
+            and flag.name not in (*plan.settings[0].values, "datasets", "n_workers")
         },
         "provenance": artifacts.provenance(),
     }  # fmt: skip
@@ -154,11 +157,13 @@ def run(path: Path, output: Path, ui: Ui, *, n_workers: int | None = None) -> di
     }
 
 
-def _mean(cells: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+def _mean(cells: Mapping[str, Mapping[str, Any]]) -> dict[str, float | None]:
     """Mean over tasks of every figure, and the standard error of the Top-N success over tasks, as the paper has it."""
     top = [cell["top_n_success"]["value"] for cell in cells.values()]
     mean = sum(top) / len(top)
-    error = math.sqrt(sum((value - mean) ** 2 for value in top) / max(len(top) - 1, 1) / len(top))
+    error = None
+    if len(top) > 1:
+        error = math.sqrt(sum((value - mean) ** 2 for value in top) / (len(top) - 1) / len(top))
     ratio = sum(cell["goal_frame_ratio"] for cell in cells.values()) / len(cells)
     return {
         "top_n_success": mean,
@@ -178,7 +183,7 @@ def _lines(result: Mapping[str, Any], measure: str) -> list[tuple[str, list[floa
     ]
     if measure != "top_n_success":
         return lines
-    by_pool = {row["setting"].get("pool", "single"): row for row in rows}
+    by_pool = {row["pool"]: row for row in rows}
     for pool, row in by_pool.items():
         chance = [row["tasks"][task]["goal_frame_ratio"] for task in tasks]
         lines.append((f"at random, pool {pool}", chance, row["mean"]["goal_frame_ratio"]))

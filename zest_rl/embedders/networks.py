@@ -100,6 +100,11 @@ def _build_registered(uri: str, rest: str, entry: importlib.metadata.EntryPoint)
     """Return what a function of somebody else's package makes of the rest of the URI."""
     try:
         network = entry.load()(rest)
+        if isinstance(network, Network):
+            kinds = {(value.device.type, value.dtype) for value in network.module.parameters()}
+            if kinds != {("cpu", torch.float32)}:
+                raise ValueError("the weights of its module must be there, in float32 and on the CPU")
+            _ = network.dim  # embeds a picture
     except ZestError:
         raise
     except Exception as error:

@@ -191,7 +191,8 @@ def _episodes(panels: tuple[EpisodePanel, ...]) -> str:
     return "".join(_episode(panel, score_range) for panel in panels)
 
 
-def _curves(curves: Iterable[Curve], x_name: str) -> str:
+def _curves(curves: Iterable[Curve], x_name: str, *, first_alone: bool = False) -> str:
+    """Draw the curves of each quantity in one chart; with `first_alone` all but the first are faint and alike."""
     by_quantity: dict[str, list[Curve]] = {}
     for curve in curves:
         by_quantity.setdefault(curve.quantity, []).append(curve)
@@ -199,7 +200,7 @@ def _curves(curves: Iterable[Curve], x_name: str) -> str:
     for quantity, group in by_quantity.items():
         lines, legend = [], []
         for index, curve in enumerate(group):
-            style = f"c{index % N_LINE_STYLES}"
+            style = "faint" if first_alone and index else f"c{index % N_LINE_STYLES}"
             band = None if curve.low is None or curve.high is None else (curve.low, curve.high)
             lines.append(Line(curve.steps, curve.values, style, band))
             legend.append(f"<li>{charts.line_key(style)}{escape(curve.method)}</li>")
@@ -312,8 +313,8 @@ def _sections(report: Report) -> list[tuple[str, str, str]]:
         intro = "Frames of one episode; below, their score between the dataset's lowest (0) and highest (1)."
         sections.append(("Frames", intro, "".join(map(_strip, report.strips))))
     if report.views:
-        intro = "The same episode by each view alone; the reward is their mean."
-        sections.append(("Views", intro, _curves(report.views, "Step")))
+        intro = "The same episode by all views together, which is the reward, and by each view alone."
+        sections.append(("Views", intro, _curves(report.views, "Step", first_alone=True)))
     if report.pixels:
         intro = "One dot is one step of that episode: a score worth training on is not the amount of change."
         body = f'<div class="small grid-of">{"".join(map(_scatter, report.pixels))}</div>'
