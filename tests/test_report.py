@@ -21,7 +21,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zest_rl.errors import BadInput
-from zest_rl.report import Curve, EpisodePanel, GoalPanel, MethodRow, Report, Scatter, render_html, write_report
+from zest_rl.report import (
+    Curve,
+    EpisodePanel,
+    GoalPanel,
+    Matrix,
+    MethodRow,
+    QualityRow,
+    QualityTable,
+    Report,
+    Scatter,
+    Strip,
+    render_html,
+    write_report,
+)
 from zest_rl.report.charts import axis_over
 
 N_STEPS = 30
@@ -69,23 +82,39 @@ def report(video: Path) -> Report:
         curves=(Curve("BC", "loss", steps, 1 / (1 + steps)), Curve("DT", "loss", steps, steps, steps - 1, steps + 1)),
         details={"config": {"lr": 1e-4, "folder": Path("runs/a")}},
         caveats=("three seeds only",),
+        warnings=("the reward is a clock",),
+        quality=QualityTable(
+            ("delta", "raw"),
+            (
+                QualityRow("rank correlation", "1 is best", ((0.71, 0.6, 0.8), None)),
+                QualityRow("a share", "of frames", ((0.25, float("nan"), float("nan")), (0.5, 0.4, 0.6))),
+            ),
+        ),
+        matrix=Matrix(("delta", "raw"), np.array([[0.61, 0.2], [0.1, 0.43]], np.float32)),
+        strips=(Strip("the best", (image, image), (0, 30), np.array([0.0, 1.2], np.float32)),),
+        views=(Curve("all views", "score", steps, steps), Curve("view 1", "score", steps, 2 * steps)),
+        pixels=(Scatter("change", steps[:3], steps[:3], 1.0, upward="a score", across="pixels", point="step"),),
+        scores_over_time=(Curve("successes", "mean reward", steps, steps),),
     )
 
 
 def test_every_section_shows_its_content(report: Report) -> None:
     html = render_html(report)
     assert re.findall(r'<section id="([a-z-]+)"', html) == [
-        "results", "caveats", "goals", "ranking", "episodes", "learning-curves", "details"
+        "results", "caveats", "warnings", "reward-quality", "tasks-against-goals", "goals", "ranking", "frames",
+        "views", "pixels", "scores-over-time", "episodes", "learning-curves", "details",
     ]  # fmt: skip
     for text in (
         "Microwave", "The reward ranks episodes.", "62.3\u00a0%", "55.1 to 69.0", "66.6\u00a0%", "must be worse",
         "three seeds only", "<q>open microwave</q>", "ρ = 0.79", "ρ = 0.83", "(0.71 to 0.90), 12 episodes",
+        "the reward is a clock", "rank correlation", "<b>0.71</b>", "0.60 to 0.80", "<b>0.61</b>", "<b>0.43</b>",
+        "the best", "step 30", 'width="100%"', "A score ↑", "Pixels →", "step 2: a score", "mean reward",
         "✓ success", "✕ no success", "evaluation only", "&quot;folder&quot;: &quot;runs/a&quot;",
     ):  # fmt: skip
         assert text in html, text
-    assert html.count('class="point"') == 12
+    assert html.count('class="point"') == 12 + 3
     assert html.count('src="data:video/mp4;base64,') == 2
-    assert html.count('src="data:image/png;base64,') == html.count("alt=") == 3
+    assert html.count('src="data:image/png;base64,') == html.count("alt=") == 3 + 2
 
 
 def test_an_empty_report_has_no_sections() -> None:
@@ -144,6 +173,9 @@ def test_figures_that_are_not_finite_are_shown_as_a_dash(report: Report) -> None
         scatters=(Scatter("s", np.array([1, nan, 2], np.float32), np.array([1, 2, inf], np.float32), nan, (nan, nan)),),
         curves=(Curve("BC", "loss", np.zeros(2, np.float32), np.full(2, nan, np.float32)),),
         details={"config": {"target": nan, "limits": [inf, np.float32("nan")], "array": np.array([nan])}},
+        quality=QualityTable(("d",), (QualityRow("q", "m", ((nan, nan, inf),)),)),
+        matrix=Matrix(("d",), np.full((1, 1), nan, np.float32)),
+        strips=(dataclasses.replace(report.strips[0], scores=np.array([nan, inf], np.float32)),),
     )
     html = render_html(broken)
     text = re.sub(r"base64,[^\"]*|<style>.*?</style>|<script>.*?</script>", "", html, flags=re.DOTALL)
@@ -318,7 +350,7 @@ def test_in_a_browser_video_and_chart_follow_each_other(browser: Browser) -> Non
         assert browser.evaluate(SHOWN_GREY) == pytest.approx(GREY + GREY_PER_STEP * step, abs=GREY_PER_STEP / 2)
 
     box = browser.evaluate(
-        '(() => { const hit = document.querySelector(".hit");'
+        '(() => { const hit = document.querySelector(".scrubber .hit");'
         'hit.scrollIntoView({ block: "center", behavior: "instant" });'
         "const { left, top, width, height } = hit.getBoundingClientRect(); return [left, top, width, height]; })()"
     )
@@ -335,7 +367,7 @@ def test_in_a_browser_video_and_chart_follow_each_other(browser: Browser) -> Non
 
 
 def test_in_a_browser_the_page_loads_without_errors_and_asks_for_nothing_else(browser: Browser) -> None:
-    assert browser.evaluate("document.querySelectorAll('.point').length") == 12
+    assert browser.evaluate("document.querySelectorAll('.point').length") == 15
     assert browser.evaluate("document.querySelector('path.line.score').getTotalLength()") > 100
     assert browser.evaluate("[...document.images].every((image) => image.naturalWidth === 160)")
     requests = [e["params"]["request"]["url"] for e in browser.events if e["method"] == "Network.requestWillBeSent"]

@@ -134,10 +134,14 @@ def _scatter(scatter: Scatter) -> str:
     )
 
 
+def _level(score: float) -> str:
+    return f"{100 * min(max(score, 0), 1):.0f}%" if math.isfinite(score) else "0"
+
+
 def _strip(strip: Strip) -> str:
     cells = "".join(
         f'<li><img src="{_png(frame)}" alt="step {step} of {escape(strip.title)}">'
-        f'<svg class="level"><rect width="{100 * min(max(float(score), 0), 1):.0f}%" height="100%" rx="3"/></svg>'
+        f'<svg class="level"><rect width="{_level(float(score))}" height="100%" rx="3"/></svg>'
         f"<b>{number(float(score))}</b>{_note(f'step {step}')}</li>"
         for frame, step, score in zip(strip.frames, strip.steps, strip.scores, strict=True)
     )
