@@ -168,8 +168,8 @@ def test_a_return_curve_holds_the_snapshots_that_were_evaluated_in_every_run(tra
 
 def test_too_few_episodes_to_rank_are_no_failure(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = scored_dataset(trained)
-    scores, truth = data.read_scores(dataset)[:2], data.read_ground_truth(dataset)[:2]
-    monkeypatch.setattr(data, "read_scores", lambda _: scores)
+    episodes, truth = data.read_episodes(dataset)[:2], data.read_ground_truth(dataset)[:2]
+    monkeypatch.setattr(data, "read_episodes", lambda _: episodes)
     monkeypatch.setattr(data, "read_ground_truth", lambda _: truth)
     assert np.isnan(goal_scatter("scene", dataset).spearman)
 

@@ -214,7 +214,7 @@ def test_relabeling_changes_rewards_adds_scores_and_keeps_everything_else_bit_fo
     assert artifacts.read_json(path / "scores.json") == [1]
     old, new = data.read_metadata(collected), data.read_metadata(NEW)
     assert new.pop("dataset_id") == NEW
-    assert new.pop("description") == "four episodes for tests And more."
+    assert new.pop("description") == "a few episodes for tests And more."
     assert new.pop("zest") == {**old.pop("zest"), "relabel": {"a": 1}}
     assert new == {key: value for key, value in old.items() if key in new}
     assert old.keys() - new.keys() == {"dataset_id", "description"}

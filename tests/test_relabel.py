@@ -130,7 +130,7 @@ def test_the_score_tells_the_episodes_that_open_the_microwave_from_the_one_that_
 def test_the_metadata_tells_how_the_rewards_were_made(relabeled: Relabeled) -> None:
     metadata = data.read_metadata(relabeled.dataset_id)
     assert metadata["dataset_id"] == relabeled.dataset_id
-    assert metadata["description"].endswith("ZeST scores (cos+delta, level) by efficientnet-lite0.")
+    assert metadata["description"].endswith("Rewards are scores (cos+delta, level) by efficientnet-lite0.")
     assert metadata["zest"]["collect"] == data.read_metadata(SOURCE)["zest"]["collect"]
     facts = metadata["zest"]["relabel"]
     assert facts["source"] == SOURCE

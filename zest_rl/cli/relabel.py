@@ -53,7 +53,7 @@ class Config:
         if not 0 < self.goal_share <= 1:
             raise BadInput(f"goal_share must be in (0, 1], got {self.goal_share}")
         if self.views < 1:
-            raise BadInput(f"views must be at least 1, got {self.views}")
+            raise BadInput(f"the number of views must be at least 1, got {self.views}")
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
