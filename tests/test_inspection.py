@@ -138,7 +138,9 @@ def test_labels_tell_what_differs() -> None:
         return {"scorer": {"config": {**config, "views": views, **changes}}, "reward": reward, "shuffle": shuffle}
 
     def named(*all_made: dict[str, Any]) -> list[str]:
-        return labels([Inspection(f"zest/{i}", "micro", one, {}, (), {}, False) for i, one in enumerate(all_made)])
+        return labels(
+            [Inspection(f"zest/{i}", "micro", one, {}, (), {}, np.zeros(0), None) for i, one in enumerate(all_made)]
+        )
 
     assert named(made()) == ["micro by same-scene"]
     assert named(made(), made(goal="/a/b/drawn")) == ["micro by same-scene", "micro by drawn"]

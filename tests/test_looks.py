@@ -20,7 +20,7 @@ def test_an_episode_is_shown_with_its_scores_by_view_and_its_change_in_pixels(
 ) -> None:
     states = data.read_states(collected)[0]
     scorer = Scorer.build(ScorerConfig(VIEWS, goal, features=features), states[0], n_workers=1)
-    look = Look.at(scorer, states)
+    look = Look(scorer, states)
     np.testing.assert_allclose(look.scores, scorer.score_episodes([states])[0][0], atol=1e-6)
     assert look.by_view.shape == (2, len(states))
     assert not np.allclose(*look.by_view)

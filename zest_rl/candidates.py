@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -15,7 +15,7 @@ from zest_rl.errors import BadInput, nearest
 from zest_rl.frames import Views, canonical_states
 from zest_rl.scorer import Scorer, ScorerConfig
 from zest_rl.selection import others
-from zest_rl.tasks import SUCCESS_PROGRESS, TASKS, Task, get_task
+from zest_rl.tasks import SUCCESS_PROGRESS, TASKS, Task
 
 Context = Literal["same", "different"]
 """Which trajectory x_0 comes from: the candidate's own (the paper's SG, as we read it), or another one (DG)."""
@@ -99,18 +99,18 @@ def draw_candidates(dataset_ids: Sequence[str], n_frames: int, seed: int = 0) ->
     return Candidates(np.stack(states), np.array(trajectory, dtype=np.intp), tuple(tasks), np.stack(starts))
 
 
-def draw_goals(scorer: Scorer, n_goals: int | None, seed: int) -> None:
-    """Keep `n_goals` of a scorer's goals, drawn with `seed`; None keeps all.
+def draw_goals(scorer: Scorer, n_goals: int | None, seed: int) -> Scorer:
+    """Return a scorer with `n_goals` of the goals, drawn with `seed`; with all of them for None.
 
     Raises:
         BadInput: there are fewer.
     """
     n = scorer.goals.shape[-2]
     if n_goals is None:
-        return
+        return scorer
     if not 1 <= n_goals <= n:
         raise BadInput(f"the goal has {n} pictures, {n_goals} cannot be drawn of them; give a number from 1 to {n}")
-    scorer.keep_goals(np.sort(np.random.default_rng(seed).permutation(n)[:n_goals]))
+    return scorer.with_goals(np.sort(np.random.default_rng(seed).permutation(n)[:n_goals]))
 
 
 def score_as_goals(
@@ -137,10 +137,10 @@ def score_as_goals(
     Returns:
         (R, M) float64.
     """
+    whole = Scorer.build(config, candidates.starts[0], n_workers=n_workers)
     rows = []
     for repeat in range(n_repeats):
-        scorer = Scorer.build(config, candidates.starts[0], n_workers=n_workers)
-        draw_goals(scorer, n_goals, repeat)
+        scorer = draw_goals(whole, n_goals, repeat)
         rows.append(scorer.score_pairs(candidates.contexts(context, repeat), candidates.states, on_progress))
     return np.stack(rows).astype(np.float64)
 
@@ -169,14 +169,13 @@ def score_as_actions(
     Returns:
         (R, M) float64.
     """
+    goal = Scorer.build(config, candidates.starts[0], n_workers=n_workers)
+    first = candidates.contexts("same", 0)
     scores = np.empty((n_repeats, len(candidates.states)))
-    for repeat in range(n_repeats):
-        own = Scorer.build(config, candidates.starts[0], n_workers=n_workers)
-        draw_goals(own, n_goals, repeat)
-        for name in sorted(set(candidates.task)):
-            seen = replace(config, views=replace(config.views, task=get_task(name).name))
-            scorer = Scorer(seen, own.starts, own.goals, own.goal_fingerprint, n_workers=n_workers)
-            frames = np.flatnonzero(np.array([task == name for task in candidates.task])[candidates.trajectory])
-            first = candidates.contexts("same", repeat)[frames]
-            scores[repeat, frames] = scorer.score_pairs(first, candidates.states[frames], on_progress)
+    for name in sorted(set(candidates.task)):
+        whole = goal.seen_as(name)
+        frames = np.flatnonzero(np.array([task == name for task in candidates.task])[candidates.trajectory])
+        for repeat in range(n_repeats):
+            scorer = draw_goals(whole, n_goals, repeat)
+            scores[repeat, frames] = scorer.score_pairs(first[frames], candidates.states[frames], on_progress)
     return scores

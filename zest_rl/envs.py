@@ -147,8 +147,14 @@ class KitchenEnv(gymnasium.Env[FloatArray, FloatArray]):
 
 def progress_of(task: Task, qpos: NDArray[np.float64]) -> NDArray[np.float64]:
     """Ground truth of recorded states (…, nq), for evaluation: position of the task's joint over its goal, (…)."""
+    return np.asarray(qpos[..., _address(task.joint)] / task.goal)
+
+
+@cache
+def _address(joint: str) -> int:
+    """Index of a joint's position in qpos; looked up once, as every step asks for it."""
     model = _load_kitchen().model
-    return np.asarray(qpos[..., model.jnt_qposadr[model.joint(task.joint).id]] / task.goal)
+    return int(model.jnt_qposadr[model.joint(joint).id])
 
 
 @dataclass(frozen=True)

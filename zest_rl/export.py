@@ -92,13 +92,13 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
     episodes = data.read_episodes(dataset_id)
     made = data.read_metadata(dataset_id).get("zest", {}).get("relabel")
     before = [0.0] * len(episodes)
+    extras: dict[str, list[NDArray[Any]]] = {}
     if made is not None:
         if rewards.shape == "difference" and made["reward"] == "difference":
             raise BadInput(f"the rewards of {dataset_id} are differences already; export them as they are")
-        before = [float(score[0]) for score in data.read_scores(dataset_id)]
-    extras: dict[str, list[NDArray[Any]]] = {}
-    if made is not None:
-        extras["zest_score"] = [score[1:] for score in data.read_scores(dataset_id)]
+        scores = data.read_scores(dataset_id)
+        before = [float(score[0]) for score in scores]
+        extras["zest_score"] = [score[1:] for score in scores]
     if data.has_ground_truth(dataset_id):
         truth = data.read_ground_truth(dataset_id)
         extras["gt_reward"] = [episode.rewards for episode in truth]

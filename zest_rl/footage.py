@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from zest_rl import artifacts
 from zest_rl.embedders import Embedder
 from zest_rl.errors import BadInput, nearest
+from zest_rl.frames import evenly_spaced
 from zest_rl.images import list_images, read_image
 from zest_rl.metrics import Values
 from zest_rl.parallel import one_thread, read_arrays, write_arrays
@@ -70,13 +71,13 @@ def read_clip(path: Path, n_frames: int) -> list[Frame]:
         raise BadInput(f"a clip needs at least 2 frames, its first and its last, got {n_frames}")
     if path.is_dir():
         pictures = sorted(list_images(path), key=_by_number)
-        frames = [read_image(pictures[i]) for i in _even(len(pictures), n_frames)]
+        frames = [read_image(pictures[i]) for i in evenly_spaced(len(pictures), n_frames)]
     elif not path.is_file():
         raise BadInput(f"{path} is not a file; give a video or a folder of pictures")
     else:
         try:
             n = sum(1 for _ in _decoded(path))  # what the file says of its length may not be what is decoded
-            wanted = set(_even(n, n_frames).tolist())
+            wanted = set(evenly_spaced(n, n_frames).tolist())
             frames = [frame for i, frame in enumerate(_decoded(path)) if i in wanted]
         except (OSError, RuntimeError, ValueError, IndexError) as error:
             reason = " ".join(str(error).split())[:200]
@@ -97,10 +98,6 @@ def _decoded(path: Path) -> Iterator[Frame]:
         reader: Any = video
         for frame in reader.iter_data():
             yield np.asarray(frame, dtype=np.uint8)
-
-
-def _even(n: int, n_wanted: int) -> NDArray[np.intp]:
-    return np.unique(np.linspace(0, n - 1, min(n, n_wanted)).round().astype(np.intp)) if n else np.zeros(0, np.intp)
 
 
 def something_something(root: Path, things: Sequence[str] = OBJECTS, template: str = OPENING) -> list[Clip]:

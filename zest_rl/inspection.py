@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,11 @@ from zest_rl import data, metrics, quality
 from zest_rl.errors import BadInput
 from zest_rl.frames import Views, canonical_states
 from zest_rl.metrics import Estimate
+from zest_rl.panels import MIN_EPISODES_TO_RANK
 from zest_rl.types import FloatArray, GroundTruth
 
 CLOCK, SATURATED, STILL, CONTRADICTORY = 0.95, 0.95, 0.9, 0.01
 """From these shares on a warning is given."""
-MIN_EPISODES = 3
 
 
 @dataclass(frozen=True)
@@ -41,12 +42,13 @@ class _Rewards:
     states: list[NDArray[np.float64]]
     """(T+1, nq) per episode, rounded as the frames were rendered."""
     truth: list[GroundTruth] | None
-    returns: NDArray[np.float64] = field(init=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "returns", quality.returns_of(self.rewards))
+    @cached_property
+    def returns(self) -> NDArray[np.float64]:
+        """(N,) float64."""
+        return quality.returns_of(self.rewards)
 
-    @property
+    @cached_property
     def true_returns(self) -> NDArray[np.float64]:
         """(N,) float64."""
         return np.array([episode.episode_return for episode in self.known_truth])
@@ -141,7 +143,15 @@ class Inspection:
     warnings: tuple[str, ...]
     over_time: Mapping[str, FloatArray]
     """Mean reward at each step (T,), of successes and failures; without ground truth, of all episodes."""
-    has_truth: bool
+    returns: NDArray[np.float64]
+    """(N,) by the rewards."""
+    true_returns: NDArray[np.float64] | None
+    """(N,); None without ground truth."""
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether the dataset holds ground truth."""
+        return self.true_returns is not None
 
     def known_figures(self) -> dict[str, Estimate | None]:
         """Every figure that was measured, by name; None where it is undefined, as for constant scores."""
@@ -160,9 +170,9 @@ def inspect(dataset_id: str) -> Inspection:
     scorer = made["scorer"]["config"]
     views = Views(**scorer["views"])
     step_rewards = [episode.rewards for episode in data.read_episodes(dataset_id)]
-    if len(step_rewards) < MIN_EPISODES:
+    if len(step_rewards) < MIN_EPISODES_TO_RANK:
         raise BadInput(
-            f"rewards can be judged on at least {MIN_EPISODES} episodes, {dataset_id} has {len(step_rewards)}"
+            f"rewards can be judged on at least {MIN_EPISODES_TO_RANK} episodes, {dataset_id} has {len(step_rewards)}"
         )
     rewards = _Rewards(
         step_rewards,
@@ -179,7 +189,14 @@ def inspect(dataset_id: str) -> Inspection:
     if made["shuffle"] is not None:
         found.insert(0, "These are the scores of other episodes: the dataset was relabeled with --shuffle.")
     return Inspection(
-        dataset_id, views.task, made, figures, tuple(found), _over_time(rewards), rewards.truth is not None
+        dataset_id,
+        views.task,
+        made,
+        figures,
+        tuple(found),
+        _over_time(rewards),
+        rewards.returns,
+        None if rewards.truth is None else rewards.true_returns,
     )
 
 

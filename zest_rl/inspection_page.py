@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from zest_rl import data
-from zest_rl.inspection import FIGURES, MIN_EPISODES, Inspection
+from zest_rl.inspection import FIGURES, Inspection
 from zest_rl.looks import Look
 from zest_rl.metrics import Estimate, spearman
-from zest_rl.panels import goal_panel, goal_scatter
+from zest_rl.panels import MIN_EPISODES_TO_RANK, goal_panel
 from zest_rl.relabel import SCORER_FILE
 from zest_rl.report import Curve, Matrix, QualityRow, QualityTable, Report, Scatter, Strip
 from zest_rl.scorer import Scorer
@@ -74,9 +73,8 @@ def confusion(
     for column, goal_of in enumerate(inspections):
         goal = Scorer.load(data.dataset_path(goal_of.dataset_id) / SCORER_FILE, n_workers=n_workers)
         for row, (episodes, seen_as) in enumerate(zip(ends, inspections, strict=True)):
-            config = replace(goal.config, views=replace(goal.config.views, task=seen_as.task))
-            scorer = Scorer(config, goal.starts, goal.goals, goal.goal_fingerprint, n_workers=n_workers)
-            means[row, column] = np.mean([score[-1] for score in scorer.score_episodes(episodes)[0]])
+            scores, _ = goal.seen_as(seen_as.task).score_episodes(episodes)
+            means[row, column] = np.mean([score[-1] for score in scores])
         on_done()
     return means
 
@@ -107,12 +105,20 @@ def look_at(inspection: Inspection, *, n_workers: int | None = None) -> dict[str
     if inspection.made["shuffle"] is not None:
         return {}
     scorer = Scorer.load(data.dataset_path(inspection.dataset_id) / SCORER_FILE, n_workers=n_workers)
-    returns = [episode.rewards.sum(dtype=np.float64) for episode in data.read_episodes(inspection.dataset_id)]
     states = data.read_states(inspection.dataset_id)
     return {
-        "best": Look.at(scorer, states[int(np.argmax(returns))]),
-        "worst": Look.at(scorer, states[int(np.argmin(returns))]),
+        "best": Look(scorer, states[int(np.argmax(inspection.returns))]),
+        "worst": Look(scorer, states[int(np.argmin(inspection.returns))]),
     }
+
+
+def _scatter(name: str, inspection: Inspection) -> Scatter | None:
+    """The returns that were inspected, against the true ones."""
+    if inspection.true_returns is None:
+        return None
+    rho = inspection.figures["Spearman ρ"]
+    returns, truth = (np.asarray(one, dtype=np.float32) for one in (inspection.returns, inspection.true_returns))
+    return Scatter(name, returns, truth, rho.value, (rho.low, rho.high))
 
 
 def _strips(name: str, dataset_id: str, looks: Mapping[str, Look]) -> list[Strip]:
@@ -135,7 +141,7 @@ def _views(name: str, look: Look) -> list[Curve]:
 def _pixels(name: str, look: Look) -> Scatter:
     changed, scores = look.pixel_difference[1:], look.scores[1:]
     rho = float("nan")
-    if len(scores) >= MIN_EPISODES:  # the interval of steps that follow each other would be far too narrow
+    if len(scores) >= MIN_EPISODES_TO_RANK:  # the interval of steps that follow each other would be far too narrow
         rho = spearman(changed.astype(np.float64), scores.astype(np.float64), n_resamples=1).value
     return Scatter(name, scores, changed, rho, upward="ZeST score", across="mean pixel difference", point="step")
 
@@ -160,9 +166,7 @@ def inspection_report(
         QualityRow(figure.name, figure.meaning, tuple(_interval(known.get(figure.name)) for known in judged))
         for figure in FIGURES
     ]
-    scatters = {
-        name: goal_scatter(name, one.dataset_id) for name, one in zip(names, inspections, strict=True) if one.has_truth
-    }
+    scatters = [_scatter(name, one) for name, one in zip(names, inspections, strict=True)]
     curves = [
         Curve(group, f"{name}: mean reward", np.arange(1, len(mean) + 1, dtype=np.float32), mean)
         for name, one in zip(names, inspections, strict=True)
@@ -177,9 +181,10 @@ def inspection_report(
         quality=QualityTable(names, tuple(rows)),
         matrix=None if means is None else Matrix(names, means),
         goals=tuple(
-            goal_panel(name, one.dataset_id, scatters.get(name)) for name, one in zip(names, inspections, strict=True)
+            goal_panel(name, one.dataset_id, scatter)
+            for name, one, scatter in zip(names, inspections, scatters, strict=True)
         ),
-        scatters=tuple(scatters.values()),
+        scatters=tuple(scatter for scatter in scatters if scatter is not None),
         strips=tuple(s for dataset, name in seen.items() for s in _strips(name, dataset, looks[dataset])),
         views=tuple(c for dataset, name in seen.items() for c in _views(name, looks[dataset]["best"])),
         pixels=tuple(_pixels(name, looks[dataset]["best"]) for dataset, name in seen.items()),

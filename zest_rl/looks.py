@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.frames import canonical_states
+from zest_rl.frames import canonical_states, evenly_spaced
 from zest_rl.scorer import Scorer
 from zest_rl.types import FloatArray
 
@@ -18,38 +18,43 @@ N_FRAMES = 8
 
 @dataclass(frozen=True)
 class Look:
-    """How the score sees one episode."""
+    """How the score sees one episode; what is not looked at is neither rendered nor scored."""
 
-    frames: NDArray[np.uint8]
-    """(n, H, W, 3) frames of the middle view, evenly spaced over the episode."""
-    steps: NDArray[np.intp]
-    """(n,) which steps they are."""
-    scores: FloatArray
-    """(T+1,) of all views together."""
-    by_view: FloatArray
-    """(V, T+1), each view's own."""
-    pixel_difference: FloatArray
-    """(T+1,) mean absolute difference to the first frame, over pixels and views, in [0, 255]."""
+    scorer: Scorer
+    """Of the dataset."""
+    states: NDArray[np.float64]
+    """(T+1, nq) simulator positions."""
 
-    @classmethod
-    def at(cls, scorer: Scorer, states: NDArray[np.float64]) -> Self:
-        """Render and score an episode.
+    @cached_property
+    def steps(self) -> NDArray[np.intp]:
+        """(n,) which steps `frames` shows, evenly spaced over the episode."""
+        return evenly_spaced(len(self.states), N_FRAMES)
 
-        Args:
-            scorer: of the dataset.
-            states: (T+1, nq) simulator positions.
-        """
-        renderer = scorer.config.views.shared_renderer()
-        distinct, inverse = np.unique(canonical_states(states, scorer.config.views), axis=0, return_inverse=True)
-        frames = np.stack([renderer.render(state) for state in distinct])  # (U, V, H, W, 3)
-        inverse = inverse.reshape(-1)
-        first = frames[inverse[0]].astype(np.int16)
-        difference = np.array([np.abs(frame - first).mean() for frame in frames], dtype=np.float32)
-        steps = np.unique(np.linspace(0, len(states) - 1, N_FRAMES).round().astype(np.intp))
-        return cls(
-            frames=frames[inverse[steps], frames.shape[1] // 2],
-            steps=steps,
-            scores=scorer.score_episodes([states])[0][0],
-            by_view=scorer.score_by_view(states),
-            pixel_difference=difference[inverse],
-        )
+    @cached_property
+    def frames(self) -> NDArray[np.uint8]:
+        """(n, H, W, 3) frames of the middle view at `steps`."""
+        frames, index = self._render(self.states[self.steps])
+        return np.asarray(frames[index, frames.shape[1] // 2])
+
+    @cached_property
+    def scores(self) -> FloatArray:
+        """(T+1,) of all views together."""
+        return self.scorer.score_episodes([self.states])[0][0]
+
+    @cached_property
+    def by_view(self) -> FloatArray:
+        """(V, T+1), each view's own."""
+        return self.scorer.score_by_view(self.states)
+
+    @cached_property
+    def pixel_difference(self) -> FloatArray:
+        """(T+1,) mean absolute difference to the first frame, over pixels and views, in [0, 255]."""
+        frames, index = self._render(self.states)
+        first = frames[index[0]].astype(np.int16)
+        return np.array([np.abs(frame - first).mean() for frame in frames], dtype=np.float32)[index]
+
+    def _render(self, states: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
+        """Render each distinct state once: (U, V, H, W, 3), and which of them each state is."""
+        views = self.scorer.config.views
+        distinct, index = np.unique(canonical_states(states, views), axis=0, return_inverse=True)
+        return np.stack([views.shared_renderer().render(state) for state in distinct]), index.reshape(-1)

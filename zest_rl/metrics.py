@@ -24,6 +24,10 @@ class Estimate:
     low: float
     high: float
 
+    def as_json(self) -> dict[str, float | list[float]]:
+        """What a verb's result holds of it."""
+        return {"value": self.value, "ci95": [self.low, self.high]}
+
 
 def normalized_return(returns: Values, minimum: float, expert: float) -> Values:
     """100 × (G − G_min) / (G_expert − G_min); 0 is the robot doing nothing, 100 the expert.

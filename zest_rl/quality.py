@@ -30,6 +30,12 @@ def _each_with(what: str, scores: Sequence[NDArray[np.generic]], others: Sequenc
             )
 
 
+def _mean_over_frames(shares: Values, scores: Sequence[NDArray[np.generic]]) -> Estimate:
+    """Average what was measured per episode (N,), each counting as many times as it has frames."""
+    lengths = np.array([len(score) for score in scores])
+    return over_episodes(lambda i: float(np.average(shares[i], weights=lengths[i])), len(scores))
+
+
 def returns_of(scores: Sequence[FloatArray]) -> Values:
     """Sum of each episode's scores: (N,) float64."""
     return np.array([score.sum(dtype=np.float64) for score in scores])
@@ -95,8 +101,7 @@ def share_saturated(scores: Sequence[FloatArray]) -> Estimate:
         return Estimate(float("nan"), float("nan"), float("nan"))
     place = [(score - low) / (high - low) for score in scores]
     shares = np.array([((p < SATURATED_BAND) | (p > 1 - SATURATED_BAND)).mean() for p in place])
-    lengths = np.array([len(score) for score in scores])
-    return over_episodes(lambda i: float(np.average(shares[i], weights=lengths[i])), len(scores))
+    return _mean_over_frames(shares, scores)
 
 
 def share_still(states: Sequence[NDArray[np.float64]]) -> Estimate:
@@ -118,8 +123,7 @@ def share_contradictory(scores: Sequence[FloatArray], states: Sequence[NDArray[n
     for score, episode in zip(scores, states, strict=True):
         _, first, group = np.unique(episode, axis=0, return_index=True, return_inverse=True)
         shares.append(float((score != score[first][group.reshape(-1)]).mean()))
-    contradictory, lengths = np.array(shares), np.array([len(score) for score in scores])
-    return over_episodes(lambda i: float(np.average(contradictory[i], weights=lengths[i])), len(scores))
+    return _mean_over_frames(np.array(shares), scores)
 
 
 def kendall(returns: Values, truth: Values) -> Estimate:

@@ -6,6 +6,7 @@ file (the goal's embeddings) with its config, so that neither the goal pictures 
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -166,6 +167,25 @@ class Scorer:
         kept = np.sort(np.argsort(-at_end, kind="stable")[:n_kept])
         self.keep_goals(kept)
         return kept
+
+    def seen_as(self, task: str) -> Scorer:
+        """Return a scorer with the same goals that sees states from the views of another task."""
+        config = replace(self.config, views=replace(self.config.views, task=task))
+        states = self.states
+        return Scorer(
+            config,
+            self.starts,
+            self.goals,
+            self.goal_fingerprint,
+            device=states.config.device,
+            n_workers=states.n_workers,
+        )
+
+    def with_goals(self, kept: NDArray[np.intp]) -> Scorer:
+        """Return a scorer with the goals of these indices alone; both share what is embedded."""
+        one = copy.copy(self)
+        one.keep_goals(kept)
+        return one
 
     def keep_goals(self, kept: NDArray[np.intp]) -> None:
         """Keep the goals with these indices and forget the others."""

@@ -78,11 +78,11 @@ def ensure_videos(
     """
     jobs = {artifacts.hash_json(str(path)): video for path, video in missing(videos).items()}
     with tempfile.TemporaryDirectory() as scratch:
-        map_jobs(_ensure, jobs, Path(scratch), n_workers=n_workers, on_done=lambda _: on_done())
+        map_jobs(_write, jobs, Path(scratch), n_workers=n_workers, on_done=lambda _: on_done())
 
 
-def _ensure(video: Video) -> dict[str, NDArray[np.generic]]:
-    ensure_video(video)
+def _write(video: Video) -> dict[str, NDArray[np.generic]]:
+    write_video(video)
     return {}
 
 

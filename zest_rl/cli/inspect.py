@@ -69,7 +69,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
             one.dataset_id: {
                 "label": label,
                 "figures": {
-                    name: None if estimate is None else {"value": estimate.value, "ci95": [estimate.low, estimate.high]}
+                    name: None if estimate is None else estimate.as_json()
                     for name, estimate in one.known_figures().items()
                 },
             }

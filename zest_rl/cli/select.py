@@ -139,7 +139,7 @@ def run(config: Arguments | select_footage.FootageArguments, ui: Ui) -> dict[str
         "task": task.name,
         "goal": config.goal,
         "top": config.top,
-        **{name: {"value": one.value, "ci95": [one.low, one.high]} for name, one in found.items()},
+        **{name: one.as_json() for name, one in found.items()},
         "goal_frame_ratio": chance,
         "times_random": found["top_n_success"].value / chance,
         "n_candidates": len(satisfies),

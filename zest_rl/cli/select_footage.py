@@ -94,9 +94,8 @@ def run(config: FootageArguments, ui: Ui) -> dict[str, Any]:
             tops.append(selection.top_up_to(scores, pool.satisfies, config.top))
             ratios.append(selection.goal_frame_ratio(pool.satisfies))
             picked.append(min(config.top, int(pool.satisfies.sum())))
-        estimate = bootstrap([np.array(tops)])
         rows[thing] = {
-            "top_n_success": {"value": estimate.value, "ci95": [estimate.low, estimate.high]},
+            "top_n_success": bootstrap([np.array(tops)]).as_json(),
             "goal_frame_ratio": float(np.mean(ratios)),
             "top": min(picked),
             "n_clips": len(own),

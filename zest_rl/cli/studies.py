@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -140,9 +140,8 @@ def run(path: Path, output: Path, ui: Ui, *, n_workers: int | None = None) -> di
         "rows": rows,
         "paper": {name: {**row, "mean": sum(row.values()) / len(row)} for name, row in plan.study.paper.items()},
         "select": {
-            flag.name: value for flag in fields(plan.settings[0].select)
-            if (value := asdict(plan.settings[0].select)[flag.name]) is not None
-            and flag.name not in (*plan.settings[0].values, "datasets", "n_workers")
+            flag: value for flag, value in asdict(plan.settings[0].select).items()
+            if value is not None and flag not in (*plan.settings[0].values, "datasets", "n_workers")
         },
         "provenance": artifacts.provenance(),
     }  # fmt: skip

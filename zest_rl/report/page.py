@@ -61,6 +61,10 @@ def _between(low: float, high: float, digits: int) -> str:
     return f"{number(low, digits)} to {number(high, digits)}" if math.isfinite(low + high) else MISSING
 
 
+def _note(text: str) -> str:
+    return f'<span class="note">{text}</span>'
+
+
 def _table(rows: tuple[MethodRow, ...]) -> str:
     figures = [v for row in rows for v in (row.mean, row.ci_low, row.ci_high, row.paper_value) if v is not None]
     axis = charts.axis_over([0, 100, *figures], 5, 0.02)
@@ -68,17 +72,17 @@ def _table(rows: tuple[MethodRow, ...]) -> str:
     body = []
     for row in rows:
         tag = "" if row.kind == "method" else f' <span class="tag">{row.kind}</span>'
-        note = f'<span class="note">{escape(row.note)}</span>' if row.note else ""
+        note = _note(escape(row.note)) if row.note else ""
         paper = f'<td class="num" data-label="Paper">{_percent(row.paper_value)}</td>' if with_paper else ""
         body.append(
             f'<tr class="{row.kind}"><th scope="row">{escape(row.method)}{tag}{note}</th>'
             f'<td class="bar-cell">{charts.interval_bar(row, axis)}</td>'
             f'<td class="num mean-cell" data-label="Mean"><b>{_percent(row.mean)}</b>'
-            f'<span class="note">{_between(row.ci_low, row.ci_high, 1)}</span></td>{paper}'
+            f"{_note(_between(row.ci_low, row.ci_high, 1))}</td>{paper}"
             f'<td class="num" data-label="IQM">{_percent(row.iqm)}</td>'
             f'<td class="num" data-label="Success">{_percent(100 * row.success_rate)}</td>'
             f'<td class="num" data-label="Episodes">{row.n_episodes}'
-            f'<span class="note">{_count(row.n_seeds, "seed")}</span></td></tr>'
+            f"{_note(_count(row.n_seeds, 'seed'))}</td></tr>"
         )
     paper_head = '<th scope="col" class="num">Paper <i class="diamond"></i></th>' if with_paper else ""
     return (
@@ -228,10 +232,6 @@ def _quality(table: QualityTable) -> str:
         ]
         body.append(f'<tr><th scope="row">{escape(row.name)}{_note(escape(row.meaning))}</th>{"".join(cells)}</tr>')
     return _wide_table("Figure", head, body)
-
-
-def _note(text: str) -> str:
-    return f'<span class="note">{text}</span>'
 
 
 def _matrix(matrix: Matrix) -> str:
