@@ -12,7 +12,7 @@ from conftest import COLLECTED
 
 from zest_rl import artifacts, data
 from zest_rl.cli import collect as collect_verb
-from zest_rl.cli import train
+from zest_rl.cli import follow, train
 from zest_rl.cli.plans import read_plan
 from zest_rl.cli.recipes import parse_config
 from zest_rl.cli.studies import read_study
@@ -130,7 +130,11 @@ def test_a_report_has_one_row_per_method_and_one_scatter_per_goal(
 # --- recipes that come with the package -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "eval").glob("*.toml")), ids=lambda path: path.name)
+EVAL = sorted((ROOT / "eval").glob("*.toml"))
+OF_A_VERB = [path for path in EVAL if "\nverb = " in path.read_text()]
+
+
+@pytest.mark.parametrize("path", [path for path in EVAL if path not in OF_A_VERB], ids=lambda path: path.name)
 def test_a_recipe_of_a_table_is_valid_and_found_from_anywhere(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -149,12 +153,15 @@ def test_a_recipe_of_a_table_is_valid_and_found_from_anywhere(
 
 
 @pytest.mark.parametrize(
-    "path", sorted([*(ROOT / "train").glob("*.toml"), *(ROOT / "datasets").glob("*.toml")]), ids=lambda path: path.name
+    "path",
+    sorted([*(ROOT / "train").glob("*.toml"), *(ROOT / "datasets").glob("*.toml"), *OF_A_VERB]),
+    ids=lambda path: path.name,
 )
 def test_a_recipe_of_a_verb_is_valid(path: Path) -> None:
     verb = next(line for line in path.read_text().splitlines() if line.startswith("verb")).split('"')[1]
     configs: dict[str, Any] = {"collect": collect_verb.Config}
     configs |= {f"train {agent}": config for agent, config in train.CONFIGS.items()}
+    configs |= {f"follow {what}": config for what, config in follow.CONFIGS.items()}
     words = ["zest/some-v0"] if verb.startswith("train") else []
     config, _ = parse_config(configs[verb], [*words, "--recipe", str(path)], verb)
     assert isinstance(config, configs[verb])

@@ -321,6 +321,7 @@ SEEK = """new Promise((resolve) => {
   video.currentTime = %s;
 })"""
 WAIT_UNTIL = "new Promise((done) => { const look = () => (%s) ? done() : setTimeout(look, 20); look(); })"
+DRAWN = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
 SHOWN_GREY = """(() => {
   const context = Object.assign(document.createElement("canvas"), { width: 64, height: 64 }).getContext("2d");
   context.drawImage(document.querySelector("video"), 0, 0);
@@ -354,6 +355,7 @@ def test_in_a_browser_video_and_chart_follow_each_other(browser: Browser) -> Non
         'hit.scrollIntoView({ block: "center", behavior: "instant" });'
         "const { left, top, width, height } = hit.getBoundingClientRect(); return [left, top, width, height]; })()"
     )
+    browser.evaluate(DRAWN)  # a mouse event finds what is drawn, which a busy machine may not have scrolled yet
     left, top, width, height = box
     for kind, share, step in (("mousePressed", 0.5, 15), ("mouseMoved", 0.8, 24), ("mouseReleased", 0.8, 24)):
         x, y = left + share * width, top + height / 2

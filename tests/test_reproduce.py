@@ -262,6 +262,7 @@ def test_one_task_may_have_several_datasets(tmp_path: Path) -> None:
         ('goal = "same-scene"', 'goal = "same-scene"\ngoal_share = 7.0', "goal_share must be in"),
         ("[evaluate]", "[evalute]", "unknown key 'evalute'; did you mean 'evaluate'"),
         ('title = "A tiny comparison"', "", "'title' is required"),
+        ('title = "A tiny comparison"', 'verb = "train dt"', "is for one verb: zest train dt --recipe"),
         ("seeds = [0]", 'seeds = ["0"]', "'seeds' must be a list of an integer, got ['0']"),
         ("seeds = [0]", "seeds = [0, 0]", "seeds must be at least 1 number, all different"),
         ("[relabel]", "[relabel.all]", "[goals.'scene']: unknown key 'all'"),
@@ -341,6 +342,22 @@ evaluate = {rtg = "constant"}
     assert "data:video/mp4" in (copy / "sdoor.html").read_text()
     lines = reproduce.summary(result).splitlines()
     assert sum(line.startswith("sdoor: Demo ") for line in lines) == 1
+
+
+def test_a_recipe_without_methods_ends_with_what_its_rewards_are_worth(
+    whole: Reproduced, tmp_path: Path, zest: Callable[..., dict[str, Any]], refusal: Callable[..., tuple[int, str]]
+) -> None:
+    without_methods = RECIPE[: RECIPE.index("[train]")]
+    result = zest("reproduce", write(tmp_path, without_methods), "--output", tmp_path / "out", "--n-workers", "1")
+    (dataset,) = result["datasets"]
+    assert data.read_metadata(dataset)["zest"]["relabel"]["source"] == "zest/kitchen-micro-whole-v0"
+    assert "Spearman ρ" in next(iter(result["datasets"].values()))["figures"]
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["datasets"] == result["datasets"]
+    assert "Views" in (tmp_path / "out" / "report.html").read_text()
+    assert "Spearman ρ" in reproduce.summary(result)
+    nothing = without_methods[: without_methods.index("[goals.scene]")]
+    code, message = refusal("reproduce", write(tmp_path, nothing))
+    assert (code, "at least 1 method, or 1 goal to inspect" in message) == (2, True)
 
 
 @pytest.mark.slow

@@ -33,6 +33,7 @@ VERBS = {
     "relabel": "a dataset and a goal (pictures or sentences) → a dataset with ZeST rewards",
     "inspect": "a relabeled dataset → what its rewards are worth, before anything is trained on them",
     "select": "datasets and a goal → does the goal find its frames (`goals`), `actions`, real `footage`?",
+    "follow": "an episode that reaches several goals → its similarity to each of them over time",
     "export": "a dataset → a file that other offline-RL code reads",
     "train": "a dataset → a policy, by `bc` or `dt`",
     "evaluate": "a policy → returns and success in MuJoCo, with videos",

@@ -16,7 +16,8 @@ A recipe has these tables (keys are the flags of the verb)::
     [methods."NAME"]                agent = "dt", goal = "NAME" (left out: ground-truth rewards), kind, note, paper,
                                     evaluate = {…} of this method alone, and the agent's own flags
 
-Methods that differ in their evaluation alone share their trained policies.
+Methods that differ in their evaluation alone share their trained policies. A recipe without methods ends with what the
+rewards of its goals are worth: the page of `zest inspect`.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class Recipe:
 
     title: str
     collect: dict[str, Any]
-    methods: dict[str, dict[str, Any]]
+    methods: dict[str, dict[str, Any]] = field(default_factory=dict)
     seeds: tuple[int, ...] = (0,)
     caveats: tuple[str, ...] = ()
     paper_demo: float | None = None
@@ -53,8 +54,8 @@ class Recipe:
     evaluate: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not self.methods:
-            raise BadInput("methods needs at least 1 method")
+        if not self.methods and not self.goals:
+            raise BadInput("a recipe needs at least 1 method, or 1 goal to inspect")
         if not self.seeds or min(self.seeds) < 0 or len(set(self.seeds)) < len(self.seeds):
             raise BadInput(f"seeds must be at least 1 number, all different and none negative, got {list(self.seeds)}")
 
@@ -138,7 +139,10 @@ def read_plan(path: Path) -> Plan:
     from zest_rl.cli.recipes import load_config, read_recipe
     from zest_rl.goals import goal_folder
 
-    recipe = load_config(Recipe, read_recipe(path), f"recipe {path}")
+    table = read_recipe(path)
+    if "verb" in table:
+        raise BadInput(f"recipe {path} is for one verb: zest {table['verb']} --recipe {path}")
+    recipe = load_config(Recipe, table, f"recipe {path}")
     goals = {}
     for name, goal in recipe.goals.items():
         where = f"recipe {path} [goals.{name!r}]"

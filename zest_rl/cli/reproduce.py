@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from zest_rl.cli import studies
+from zest_rl.cli import inspect, studies
 from zest_rl.cli.plans import Cell, Plan, TaskData, plan_cells, read_plan
 from zest_rl.cli.recipes import read_recipe
 from zest_rl.cli.ui import SilentUi, Ui
@@ -59,6 +59,11 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     collected, datasets = {}, {}
     for task, collect_config in plan.collect.items():
         collected[task], datasets[task] = _make_datasets(plan, task, collect_config, config.n_workers, ui)
+    if not plan.methods:
+        relabeled = tuple(dataset for of_task in datasets.values() for dataset in of_task.by_goal.values())
+        inspected = inspect.run(inspect.Config(relabeled, output / "report.html", config.n_workers), ui)
+        artifacts.write_json(output / "result.json", {**inspected, "provenance": artifacts.provenance()})
+        return {**inspected, "seconds": round(time.monotonic() - started, 1)}
     cells = plan_cells(plan, datasets, output)
     ui.say(f"[3/4] train and evaluate {len(cells)} cells in {output / 'cells'}")
     n_run = run_cells(cells, output, ui, n_workers=config.n_workers)
@@ -211,6 +216,8 @@ def summary(result: Mapping[str, Any]) -> str:
     """The table as text."""
     if "study" in result:
         return studies.summary(result)
+    if "goals_against_tasks" in result:
+        return inspect.summary(result)
     lines = [
         f"{'':<28}{'% of expert':>12}  {'95 % interval':<18}{'success':>8}{'seeds':>7}{'episodes':>10}{'paper':>8}"
     ]

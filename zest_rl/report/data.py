@@ -177,7 +177,7 @@ class Strip:
     steps: tuple[int, ...]
     """Which step of the episode each is."""
     scores: FloatArray
-    """(n,) float32, normalised: 0 is the lowest and 1 the highest score of the dataset."""
+    """(n,) float32, normalised: 0 is the lowest and 1 the highest score of the dataset, or of the episode alone."""
 
     def __post_init__(self) -> None:
         _check_equal_lengths(
@@ -242,6 +242,8 @@ class Report:
     """Scores against how many pixels change."""
     scores_over_time: tuple[Curve, ...] = ()
     """Mean scores; their `steps` are those of an episode."""
+    sub_goals: tuple[Curve, ...] = ()
+    """Scores of one episode by each of its sub-goals."""
     curves: tuple[Curve, ...] = ()
     details: Mapping[str, object] = field(default_factory=dict)
     """Configs, versions, provenance: name → anything that reads as JSON; each is a collapsed block."""

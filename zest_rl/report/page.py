@@ -314,7 +314,7 @@ def _sections(report: Report) -> list[tuple[str, str, str]]:
         body = f'<div class="small grid-of">{"".join(map(_scatter, report.scatters))}</div>'
         sections.append(("Ranking", intro, body))
     if report.strips:
-        intro = "Frames of one episode; below, their score between the dataset's lowest (0) and highest (1)."
+        intro = "Frames of one episode; below, their score between the lowest (0) and the highest (1)."
         sections.append(("Frames", intro, "".join(map(_strip, report.strips))))
     if report.views:
         intro = "The same episode by all views together, which is the reward, and by each view alone."
@@ -326,6 +326,9 @@ def _sections(report: Report) -> list[tuple[str, str, str]]:
     if report.scores_over_time:
         intro = "Mean score at each step: a reward worth training on parts successes from failures."
         sections.append(("Scores over time", intro, _curves(report.scores_over_time, "Step")))
+    if report.sub_goals:
+        intro = "Each frame against each sub-goal: the lines should rise one after another."
+        sections.append(("Sub-goals", intro, _curves(report.sub_goals, "Step")))
     if report.episodes:
         intro = "Drag in a chart, or focus it and press the arrow keys, to move through the video; space plays."
         sections.append(("Episodes", intro, _episodes(report.episodes)))

@@ -1,0 +1,151 @@
+"""``zest follow``: an episode that reaches several goals → its similarity to each of them over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import tyro
+
+from zest_rl.cli.ui import Ui
+from zest_rl.scores import Features, Similarity, check_names
+
+if TYPE_CHECKING:
+    from zest_rl.multistep import Followed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """What both kinds of episode need."""
+
+    what: ClassVar[str]
+    embedder: str = "efficientnet-lite0"
+    """As in `zest relabel`."""
+    features: Features = "delta"
+    """As in `zest relabel`."""
+    similarity: Similarity = "cos"
+    """As in `zest relabel`."""
+    precision: Literal["auto", "fp32", "bf16"] = "auto"
+    """Of the embedder."""
+    device: str = "auto"
+    """auto, cpu, cuda, cuda:1, …"""
+    output: Path = Path("follow.html")
+    """The HTML page."""
+
+    def __post_init__(self) -> None:
+        check_names(self.features, self.similarity)
+
+
+@dataclass(frozen=True, kw_only=True)
+class KitchenArguments(Arguments):
+    """Experts do several kitchen tasks one after another; each task is a sub-goal, seen from its own views."""
+
+    what: ClassVar[str] = "kitchen"
+    tasks: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TASK TASK …")]
+    """In the order in which they are done."""
+    goal: str = "same-scene"
+    """As in `zest relabel`, of every task."""
+    views: int = 8
+    """Cameras around the object; scores are averaged over them."""
+    tolerance: float = 1e-3
+    """As in `zest relabel`."""
+    seed: int = 0
+    """Of the arm's start."""
+    n_workers: int | None = None
+    """Processes that embed; default one per core."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoArguments(Arguments):
+    """A video, or a folder of pictures in the order of their names; each sub-goal is a picture (the video's first frame
+    is its start), a folder with init/ and goal/, or "text:START -> GOAL".
+    """
+
+    what: ClassVar[str] = "video"
+    clip: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIDEO")]
+    """What to follow."""
+    goals: tuple[str, ...]
+    """Sub-goals, in the order in which they should be reached."""
+    n_frames: int = 100
+    """Frames that are looked at, evenly spaced; a shorter video gives all it has."""
+
+
+CONFIGS: dict[str, type[Any]] = {config.what: config for config in (KitchenArguments, VideoArguments)}
+
+
+def run(config: KitchenArguments | VideoArguments, ui: Ui) -> dict[str, Any]:
+    """Score the episode by each sub-goal and write the page."""
+    from zest_rl import artifacts
+    from zest_rl.multistep import follow_report, rise_in_order
+    from zest_rl.report import write_report
+
+    followed = _kitchen(config, ui) if isinstance(config, KitchenArguments) else _video(config)
+    in_order = rise_in_order(followed)
+    if not in_order:
+        ui.warn("the scores do not rise in the order of the sub-goals; look at the page")
+    settings = {**asdict(config), "output": str(config.output)}
+    if isinstance(config, VideoArguments):
+        settings["clip"] = str(config.clip)
+    details: dict[str, object] = {"settings": settings, "provenance": artifacts.provenance()}
+    page = write_report(follow_report("Similarity to each sub-goal", followed, details), config.output)
+    return {
+        "follow": config.what,
+        "sub_goals": {
+            one.name: {
+                "rises_at": one.rises_at,
+                "highest_at": one.highest_at,
+                "done_at": one.done_at,
+                "scores": [round(float(score), 4) for score in one.scores],
+            }
+            for one in followed
+        },
+        "in_order": in_order,
+        "settings": settings,
+        "report": str(page),
+        "next": f"open {page} in a browser",
+    }
+
+
+def _kitchen(config: KitchenArguments, ui: Ui) -> list[Followed]:
+    from zest_rl.frames import Views
+    from zest_rl.multistep import follow_performance, perform
+    from zest_rl.scorer import Scorer, ScorerConfig
+    from zest_rl.tasks import get_task
+
+    for task in config.tasks:
+        get_task(task)
+    performance = perform(config.tasks, config.seed)
+
+    def build(task: str) -> Scorer:
+        views = Views(task, config.views, tolerance=config.tolerance)
+        scorer = ScorerConfig(views, config.goal, config.embedder, config.features, config.similarity, config.precision)
+        return Scorer.build(scorer, performance.states[0], device=config.device, n_workers=config.n_workers)
+
+    with ui.progress("sub-goals", len(config.tasks)) as advance:
+        return follow_performance(performance, build, advance)
+
+
+def _video(config: VideoArguments) -> list[Followed]:
+    from zest_rl.embedders import load_embedder
+    from zest_rl.multistep import follow_clip
+
+    embedder = load_embedder(config.embedder, device=config.device, precision=config.precision)
+    return follow_clip(config.clip, config.goals, embedder, config.n_frames, config.features, config.similarity)
+
+
+def summary(result: Mapping[str, Any]) -> str:
+    """One line per sub-goal, as text."""
+    lines = [
+        f"  {name:<16} rises at step {one['rises_at']:>3}, highest at {one['highest_at']:>3}"
+        + ("" if one["done_at"] is None else f", done at {one['done_at']:>3}")
+        for name, one in result["sub_goals"].items()
+    ]
+    return "\n".join(
+        [
+            *lines,
+            f"in the order of the sub-goals: {'yes' if result['in_order'] else 'no'}",
+            f"report: {result['report']}",
+        ]
+    )
