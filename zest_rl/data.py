@@ -319,7 +319,7 @@ def describe(dataset_id: str) -> dict[str, Any]:
 
 
 def is_foreign(metadata: Mapping[str, Any]) -> bool:
-    """Whether a relabeled dataset's frames came from elsewhere than our renderer of the kitchen."""
+    """Whether a dataset's metadata or `describe` say that it was relabeled by frames that are not of our kitchen."""
     return "frames" in metadata.get("zest", {}).get("relabel", {})
 
 

@@ -18,10 +18,10 @@ class Config:
 
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
     """Minari dataset: of zest/Kitchen-v1, or of any robot, with pictures among its observations or recorded
-    MuJoCo states."""
+    MuJoCo states; or the path of a robomimic HDF5 file or a LeRobot v3 folder."""
     frames: tuple[str, ...] = ()
-    """Where the frames are, when they are not rendered from the kitchen's states: observations/KEY with pictures,
-    several to average them as views. Default: the only one there is."""
+    """Where the frames are: entries with pictures (observations/KEY), or folders with episode_0.mp4, … or episode_0/
+    with pictures; several are views that are averaged. Default: the only pictures there are, else recorded states."""
     camera: tuple[str, ...] = ()
     """Cameras of the environment's model, to render recorded states from, averaged as views. Default: its own."""
     goal: str = "same-scene"

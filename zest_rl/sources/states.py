@@ -140,7 +140,8 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
     """
     if env_spec is None:
         raise BadInput(
-            f"{what} names no environment (env_spec), so its states cannot be rendered; give --frames FOLDER"
+            f"{what} shows no frames: there are no pictures to choose, and it names no environment whose recorded "
+            "states could be rendered; give --frames FOLDER with a video of each episode"
         )
     spec = json.loads(env_spec)
     entry_point, kwargs = str(spec["entry_point"]), spec.get("kwargs") or {}
