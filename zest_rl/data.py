@@ -319,7 +319,7 @@ def describe(dataset_id: str) -> dict[str, Any]:
 
 
 def is_foreign(metadata: Mapping[str, Any]) -> bool:
-    """Whether a dataset's metadata or `describe` say that it was relabeled by frames that are not of our kitchen."""
+    """Whether a dataset's metadata or `describe` say that it was relabeled by frames that we did not render."""
     return "frames" in metadata.get("zest", {}).get("relabel", {})
 
 

@@ -8,6 +8,7 @@ rewards it was trained on. Ground-truth rewards are recorded, and shown to no po
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -249,8 +250,9 @@ def evaluate(
     check_finished(run)
     run = run.resolve()
     policy = load_policy(run, device=device)
-    if data.is_foreign(policy.meta["dataset"]):
-        dataset_id = policy.meta["dataset"]["id"]
+    dataset = policy.meta["dataset"]
+    if data.is_foreign(dataset) and json.loads(dataset["env_spec"] or "{}").get("id") != ENV_ID:
+        dataset_id = dataset["id"]
         raise BadInput(
             f"`zest evaluate` runs {ENV_ID} alone, and {run.name} was trained on {dataset_id}; act with it from Python "
             f"(zest_rl.agents.load_policy), or hand the data to other code: zest export {dataset_id}"

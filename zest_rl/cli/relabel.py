@@ -90,7 +90,6 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
 def _from_states(config: Config, ui: Ui) -> dict[str, Any]:
     """Relabel a dataset of the kitchen."""
-
     from zest_rl import data
     from zest_rl.frames import Views
     from zest_rl.relabel import relabel
