@@ -16,10 +16,10 @@ PACKAGE = Path(zest_rl.__file__).parent
 ROOT = PACKAGE.parent
 
 ORDER = (
-    "load_order", "errors", "types", "artifacts", "parallel", "tasks", "data", "data_writer", "metrics", "quality",
-    "envs", "arm", "experts", "collect",
+    "load_order", "errors", "types", "artifacts", "parallel", "tasks", "observations", "data", "data_writer",
+    "metrics", "quality", "envs", "arm", "experts", "collect",
     "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "looks", "selection",
-    "footage", "relabel", "export", "agents",
+    "footage", "relabel", "sources", "frame_scorer", "relabel_frames", "export", "agents",
     "checkpoints", "training", "evaluation", "report", "panels", "comparison", "inspection",
     "inspection_page", "candidates", "multistep",
     "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.inspect", "cli.select_footage",

@@ -221,11 +221,11 @@ def test_a_missing_array_is_named(collected: str, name: str) -> None:
         data.read_episodes(collected)
 
 
-def test_a_dictionary_observation_is_refused(collected: str) -> None:
+def test_a_dictionary_of_pictures_alone_is_refused(collected: str) -> None:
     with edited(collected) as file:
         del file["episode_0/observations"]
-        file["episode_0/observations/camera"] = np.zeros((101, 3))
-    with pytest.raises(BadInput, match=r"'observations' in /episode_0 .* must be one flat array, got a group"):
+        file["episode_0/observations/camera"] = np.zeros((101, 8, 8, 3), np.uint8)
+    with pytest.raises(BadInput, match=r"/episode_0/observations holds pictures only; a policy here needs numbers"):
         data.read_episodes(collected)
 
 

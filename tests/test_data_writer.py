@@ -316,19 +316,19 @@ def test_a_disk_that_fills_up_while_writing_is_an_error_of_this_process_and_leav
 
 
 @pytest.mark.parametrize(
-    ("n_pages_short", "rule"),
-    [(20, "cannot write .*: No space left on device; nothing was left behind"), (0, WRITE_FAILED)],
+    "n_pages_short",
+    [20, 0],
     ids=["copying", "rewriting"],
 )
 def test_a_disk_that_fills_up_while_relabeling_leaves_the_source_alone(
-    n_pages_short: int, rule: str, collected: str, small_root: Disk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    n_pages_short: int, collected: str, small_root: Disk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     shutil.copytree(tmp_path / "minari", small_root.path, dirs_exist_ok=True)
     monkeypatch.setattr(artifacts, "check_free_space", lambda folder, n_bytes: None)
     before = arrays_of(collected), left_behind(small_root.path)
     copied = [data.dataset_path(collected) / name for name in (data.DATA_FILE, data.METADATA_FILE)]
     small_root.fill(4096 * (sum(-(-path.stat().st_size // 4096) for path in copied) - n_pages_short))
-    with pytest.raises(ZestError, match=rule):
+    with pytest.raises(ZestError, match=WRITE_FAILED):
         relabel(collected)
     assert (arrays_of(collected), left_behind(small_root.path)) == before
     assert listed() == {collected}

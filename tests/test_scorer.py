@@ -198,7 +198,7 @@ def test_a_scorer_of_other_weights_is_refused(tmp_path: Path) -> None:
     def write(seed: int) -> None:
         torch.manual_seed(seed)
         torch.save(timm.create_model("resnet10t", pretrained=False).state_dict(), weights)
-        embed._embedder.cache_clear()  # as in a later process
+        embed.shared_embedder.cache_clear()  # as in a later process
 
     write(0)
     build(opening(1), embedder=f"timm:resnet10t@{weights}").save(tmp_path / "scorer.safetensors")

@@ -16,7 +16,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,11 @@ def hash_json(value: object) -> str:
 
 def hash_arrays(*arrays: NDArray[Any]) -> str:
     """Return the sha256 over dtype, shape and bytes of all arrays, in order, 64 hex digits."""
+    return hash_stream(arrays)
+
+
+def hash_stream(arrays: Iterable[NDArray[Any]]) -> str:
+    """Return the `hash_arrays` of arrays that are not all in memory at once."""
     digest = hashlib.sha256()
     for array in arrays:
         digest.update(f"{array.dtype.str}{array.shape}".encode())

@@ -1,4 +1,4 @@
-"""Minari datasets on disk → episodes (`zest_rl.data_writer` is the way back; no other module touches HDF5).
+"""Minari datasets on disk → episodes (`zest_rl.data_writer` is the way back).
 
 Layout of one dataset, alignment in `zest_rl.types`::
 
@@ -9,15 +9,19 @@ Layout of one dataset, alignment in `zest_rl.types`::
                                 terminations (T,), truncations (T,), infos/state/{qpos, qvel} (T+1, n),
                                 infos/gt/{reward, success} (T+1,), infos/zest/score (T+1,) once relabeled}
 
+Datasets of other environments may hold observations in a group (`zest_rl.observations`), no state and no ground truth;
+once relabeled, the rewards that they came with are ``infos/source/reward`` (T+1,), 0 at the reset.
+
 Ground truth is read by `read_ground_truth` alone; `read_episodes` and `read_states` never open it.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -28,11 +32,14 @@ from numpy.typing import NDArray
 
 from zest_rl import artifacts
 from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.observations import entries, n_channels, numbers, stored_rows
 from zest_rl.types import Episode, FloatArray, GroundTruth
 
 DATASET_ID = re.compile(r"(?:[A-Za-z0-9][\w.-]+/)*[A-Za-z0-9][\w.-]*-v\d+")
 TRUSTED_ENTRY_POINTS = ("gymnasium.", "gymnasium_robotics.", "zest_rl.")
 DATA_FILE, METADATA_FILE, MANIFEST_FILE = "data/main_data.hdf5", "data/metadata.json", "zest_manifest.json"
+SOURCE_REWARD = "infos/source/reward"
+"""Where the rewards of another environment's dataset are kept when it is relabeled."""
 
 
 def datasets_root() -> Path:
@@ -153,24 +160,50 @@ def _each(dataset_id: str, read: Callable[[h5py.Group], Any]) -> list[Any]:
     return results
 
 
-def read_episodes(dataset_id: str) -> list[Episode]:
-    """Read what a trainer may see of every episode.
+def _observations(group: h5py.Group, dataset_id: str) -> FloatArray:
+    node = group.get("observations")
+    if isinstance(node, h5py.Group) or (node is not None and n_channels(node) is not None):
+        return numbers(node)
+    return _array(group, "observations", np.float32, dataset_id)
+
+
+def episode_names(dataset_id: str) -> list[str]:
+    """Return the names of the episodes' groups in the HDF5 file, in order.
 
     Raises:
-        BadInput: no such dataset, an episode without steps, lengths that do not fit, NaN.
+        BadInput: no such dataset, another storage than HDF5, or no episodes.
+    """
+    with _open(dataset_id) as (_, names):
+        return names
+
+
+def read_episodes(dataset_id: str) -> list[Episode]:
+    """Read what a trainer may see of every episode; a Dict of observations is flattened (`observations.numbers`).
+
+    Raises:
+        BadInput: no such dataset, an episode without steps, lengths that do not fit, NaN, no observations but pictures.
         ZestError: the files were damaged.
     """
 
     def read(group: h5py.Group) -> Episode:
         ends = _array(group, "terminations", bool, dataset_id)
         return Episode(
-            obs=_array(group, "observations", np.float32, dataset_id),
+            obs=_observations(group, dataset_id),
             actions=_array(group, "actions", np.float32, dataset_id),
             rewards=_array(group, "rewards", np.float32, dataset_id),
             terminated=bool(len(ends) and ends[-1]),
         )
 
     return _each(dataset_id, read)
+
+
+def read_rewards(dataset_id: str) -> list[FloatArray]:
+    """Read the rewards (T,) of every episode, and nothing else.
+
+    Raises:
+        BadInput: no such dataset, or one without rewards.
+    """
+    return _each(dataset_id, lambda group: _array(group, "rewards", np.float32, dataset_id))
 
 
 def read_states(dataset_id: str) -> list[NDArray[np.float64]]:
@@ -224,13 +257,39 @@ def read_scores(dataset_id: str) -> list[FloatArray]:
     return _each(dataset_id, lambda group: _array(group, "infos/zest/score", np.float32, dataset_id))
 
 
+def read_source_rewards(dataset_id: str) -> list[FloatArray] | None:
+    """Read the rewards (T,) that a dataset of another environment came with before it was relabeled; None: no such."""
+    found = _each(
+        dataset_id,
+        lambda group: _array(group, SOURCE_REWARD, np.float32, dataset_id)[1:] if SOURCE_REWARD in group else None,
+    )
+    return None if any(rewards is None for rewards in found) else found
+
+
 def fingerprint(dataset_id: str) -> str:
     """Hash what relabeling and training may see of a dataset: observations, actions, ends and states; no rewards."""
-    digests = [
-        artifacts.hash_arrays(episode.obs, episode.actions, np.array([episode.terminated]), states)
-        for episode, states in zip(read_episodes(dataset_id), read_states(dataset_id), strict=True)
-    ]
-    return artifacts.hash_json(digests)
+
+    def digest(group: h5py.Group) -> str:
+        _array(group, "rewards", np.float32, dataset_id)
+        if "observations" not in group:
+            raise BadInput(f"dataset {dataset_id} has no 'observations' in {group.name}")
+        actions = _array(group, "actions", np.float32, dataset_id)
+        ends = _array(group, "terminations", bool, dataset_id)
+        arrays = [actions, np.array([bool(len(ends) and ends[-1])])]
+        if "infos/state/qpos" in group:
+            arrays.append(_array(group, "infos/state/qpos", np.float64, dataset_id))
+        return artifacts.hash_stream(itertools.chain(_observed(group["observations"]), arrays))
+
+    return artifacts.hash_json(_each(dataset_id, digest))
+
+
+def _observed(node: h5py.Group | h5py.Dataset) -> Iterator[NDArray[Any]]:
+    """Yield an episode's observations in parts: pictures as they are stored, a few at a time, numbers as float32."""
+    for entry in entries(node).values():
+        if n_channels(entry) is None and entry.dtype.kind in "biuf":
+            yield np.asarray(entry[()], dtype=np.float32)
+        else:
+            yield from stored_rows(entry)
 
 
 def describe(dataset_id: str) -> dict[str, Any]:
@@ -240,7 +299,7 @@ def describe(dataset_id: str) -> dict[str, Any]:
     """
     metadata = read_metadata(dataset_id)
     for key in ("env_spec", "ref_min_score", "ref_max_score"):
-        if metadata.get(key) is None:
+        if metadata.get(key) is None and not is_foreign(metadata):
             raise BadInput(
                 f"dataset {dataset_id} has no {key} in its metadata, so a policy could not be evaluated on it; "
                 "give env, eval_env and both reference scores when the dataset is made"
@@ -249,14 +308,26 @@ def describe(dataset_id: str) -> dict[str, Any]:
         "id": dataset_id,
         "sha256": fingerprint(dataset_id),
         "rewards_sha256": artifacts.hash_arrays(*(episode.rewards for episode in read_episodes(dataset_id))),
-        "env_spec": metadata["env_spec"],
-        "ref_min_score": metadata["ref_min_score"],
-        "ref_max_score": metadata["ref_max_score"],
+        "env_spec": metadata.get("env_spec"),
+        "ref_min_score": metadata.get("ref_min_score"),
+        "ref_max_score": metadata.get("ref_max_score"),
         "zest": {
             stage: {key: value for key, value in facts.items() if key != "provenance"}
             for stage, facts in metadata.get("zest", {}).items()
         },
     }
+
+
+def is_foreign(metadata: Mapping[str, Any]) -> bool:
+    """Whether a dataset's metadata or `describe` say that it was relabeled by frames that we did not render."""
+    return "frames" in metadata.get("zest", {}).get("relabel", {})
+
+
+def kitchen_task(dataset_id: str) -> str | None:
+    """Return which kitchen task a dataset is of, None when its environment is another one."""
+    spec = json.loads(read_metadata(dataset_id).get("env_spec") or "{}")
+    name = spec.get("kwargs", {}).get("task")
+    return None if name is None or not str(spec.get("entry_point")).startswith("zest_rl.") else str(name)
 
 
 def task_name(dataset_id: str) -> str:
@@ -265,11 +336,11 @@ def task_name(dataset_id: str) -> str:
     Raises:
         BadInput: its environment is not the kitchen.
     """
-    spec = json.loads(read_metadata(dataset_id).get("env_spec") or "{}")
-    name = spec.get("kwargs", {}).get("task")
-    if name is None or not str(spec.get("entry_point")).startswith("zest_rl."):
+    name = kitchen_task(dataset_id)
+    if name is None:
+        spec = json.loads(read_metadata(dataset_id).get("env_spec") or "{}")
         raise BadInput(
             f"dataset {dataset_id} is of environment {spec.get('id')!r}; frames can be rendered for zest/Kitchen-v1 "
-            "only, so collect a dataset with `zest collect`"
+            "only, so collect a dataset with `zest collect`; `zest relabel` alone takes any, see docs/any_dataset.md"
         )
-    return str(name)
+    return name

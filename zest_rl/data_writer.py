@@ -12,15 +12,26 @@ import shutil
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl import artifacts
-from zest_rl.data import DATA_FILE, MANIFEST_FILE, METADATA_FILE, dataset_path, exists, read_episodes, read_metadata
+from zest_rl.data import (
+    DATA_FILE,
+    MANIFEST_FILE,
+    METADATA_FILE,
+    SOURCE_REWARD,
+    dataset_path,
+    exists,
+    fingerprint,
+    read_metadata,
+    read_rewards,
+)
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.parallel import die_with_parent, starting_children
 from zest_rl.types import Episode, FloatArray
@@ -205,16 +216,78 @@ def write_dataset(
     return final
 
 
+class Trajectories(Protocol):
+    """The episodes that get new rewards."""
+
+    @property
+    def dataset_id(self) -> str:
+        """The Minari id that they have, or would have."""
+
+    @property
+    def n_steps(self) -> Sequence[int]:
+        """T of every episode."""
+
+    @property
+    def n_bytes(self) -> int:
+        """About what `fill` writes."""
+
+    def fingerprint(self) -> str:
+        """64 hex digits over all that training may see of them, but no rewards."""
+
+    def fill(self, folder: Path) -> None:
+        """Leave a Minari dataset's `DATA_FILE` and `METADATA_FILE` in `folder`, never all episodes in memory.
+
+        Runs in a process of its own. Rewards that are not there to begin with are NaN.
+        """
+
+
+@dataclass(frozen=True)
+class Copied:
+    """The `Trajectories` of a Minari dataset, copied as they are."""
+
+    dataset_id: str
+
+    @cached_property
+    def n_steps(self) -> Sequence[int]:
+        """T of every episode."""
+        return [len(rewards) for rewards in read_rewards(self.dataset_id)]
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the HDF5 file."""
+        return (dataset_path(self.dataset_id) / DATA_FILE).stat().st_size
+
+    def fingerprint(self) -> str:
+        """See `zest_rl.data.fingerprint`."""
+        return fingerprint(self.dataset_id)
+
+    def fill(self, folder: Path) -> None:
+        """Copy the two files."""
+        (folder / "data").mkdir()
+        for name in (DATA_FILE, METADATA_FILE):
+            shutil.copyfile(dataset_path(self.dataset_id) / name, folder / name)
+
+
 def _rewrite_rewards(path: Path, rewards: Sequence[FloatArray], scores: Sequence[FloatArray]) -> None:
     with h5py.File(path, "r+") as file:
         for i, (reward, score) in enumerate(zip(rewards, scores, strict=True)):
             group = file[f"episode_{i}"]
+            before = np.asarray(group["rewards"][()], np.float32)
             del group["rewards"]
             group["rewards"] = reward
             infos = group.require_group("infos")
+            if not ("infos/gt" in group or SOURCE_REWARD in group or np.isnan(before).any()):
+                group[SOURCE_REWARD] = np.concatenate([np.zeros(1, np.float32), before])
             if "zest" in infos:
                 del infos["zest"]
             infos["zest/score"] = score
+
+
+def _build_scored(
+    trajectories: Trajectories, folder: Path, rewards: Sequence[FloatArray], scores: Sequence[FloatArray]
+) -> None:
+    trajectories.fill(folder)
+    _rewrite_rewards(folder / DATA_FILE, rewards, scores)
 
 
 def write_relabeled(
@@ -227,10 +300,27 @@ def write_relabeled(
     zest: Mapping[str, Any],
     extra: Callable[[Path], None],
 ) -> Path:
-    """Write a copy of a dataset with other rewards; everything else, ground truth included, stays bit for bit.
+    """Write a copy of a Minari dataset with other rewards: `write_scored` of its trajectories."""
+    read_metadata(source_id)  # its files are whole, its environment is trusted
+    return write_scored(Copied(source_id), dataset_id, rewards, scores, description=description, zest=zest, extra=extra)
+
+
+def write_scored(
+    trajectories: Trajectories,
+    dataset_id: str,
+    rewards: Sequence[FloatArray],
+    scores: Sequence[FloatArray],
+    *,
+    description: str,
+    zest: Mapping[str, Any],
+    extra: Callable[[Path], None],
+) -> Path:
+    """Write episodes with other rewards; everything else, ground truth included, stays bit for bit.
+
+    Rewards that are not the kitchen's ground truth are kept as ``infos/source/reward``.
 
     Args:
-        source_id: the dataset to copy.
+        trajectories: the episodes.
         dataset_id: the new id; must not exist.
         rewards: (T,) float32 per episode.
         scores: (T+1,) float32 per episode, kept as ``infos/zest/score``.
@@ -245,9 +335,7 @@ def write_relabeled(
         BadInput: the new id exists; lengths do not fit; a value is not finite.
         ZestError: the disk is full or read-only; nothing is left behind.
     """
-    source, final = dataset_path(source_id), dataset_path(dataset_id)
-    metadata = read_metadata(source_id)
-    n_steps = [len(episode) for episode in read_episodes(source_id)]
+    final, n_steps = dataset_path(dataset_id), list(trajectories.n_steps)
     if [len(r) for r in rewards] != n_steps or [len(s) for s in scores] != [n + 1 for n in n_steps]:
         raise BadInput("rewards must have length T and scores length T+1 for every episode of the source dataset")
     if not all(np.isfinite(array).all() for array in (*rewards, *scores)):
@@ -255,12 +343,10 @@ def write_relabeled(
     with artifacts.lock(final):
         if exists(dataset_id):
             raise BadInput(f"dataset {dataset_id} exists already; choose another name or delete {final}")
-        artifacts.check_free_space(final.parent, 2 * (source / DATA_FILE).stat().st_size)
+        artifacts.check_free_space(final.parent, 2 * trajectories.n_bytes)
         with artifacts.staged_folder(final) as staging:
-            (staging / "data").mkdir()
-            shutil.copyfile(source / DATA_FILE, staging / DATA_FILE)
-            shutil.copyfile(source / METADATA_FILE, staging / METADATA_FILE)
-            _in_child(_rewrite_rewards, staging / DATA_FILE, rewards, scores)
+            _in_child(_build_scored, trajectories, staging, rewards, scores)
+            metadata = artifacts.read_json(staging / METADATA_FILE)
             _set_metadata(
                 staging / METADATA_FILE,
                 dataset_id=dataset_id,

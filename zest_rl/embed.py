@@ -38,11 +38,12 @@ class EmbedConfig:
 
     def load_embedder(self) -> Embedder:
         """Return the embedder, shared within the process; the default's network is loaded at its first picture."""
-        return _embedder(self.embedder, self.precision, self.device)
+        return shared_embedder(self.embedder, self.precision, self.device)
 
 
 @functools.lru_cache(maxsize=2)
-def _embedder(uri: str, precision: Precision, device: str) -> Embedder:
+def shared_embedder(uri: str, precision: Precision, device: str) -> Embedder:
+    """Return this process's embedder of a URI, see `load_embedder`."""
     return load_embedder(uri, device=device, precision=precision)
 
 

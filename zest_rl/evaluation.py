@@ -8,6 +8,7 @@ rewards it was trained on. Ground-truth rewards are recorded, and shown to no po
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl import artifacts
+from zest_rl import artifacts, data
 from zest_rl.agents import Policy, load_policy
 from zest_rl.data import check_env_spec
 from zest_rl.envs import ENV_ID
@@ -242,12 +243,20 @@ def evaluate(
         on_progress: called with the number of episodes that were finished.
 
     Raises:
-        BadInput: the run was not trained to its end, or has no scorer although scores are asked for.
+        BadInput: the run was not trained to its end, is of another robot than the kitchen's, or has no scorer although
+            scores are asked for.
         ZestError: a part of the run is damaged.
     """
     check_finished(run)
     run = run.resolve()
     policy = load_policy(run, device=device)
+    dataset = policy.meta["dataset"]
+    if data.is_foreign(dataset) and json.loads(dataset["env_spec"] or "{}").get("id") != ENV_ID:
+        dataset_id = dataset["id"]
+        raise BadInput(
+            f"`zest evaluate` runs {ENV_ID} alone, and {run.name} was trained on {dataset_id}; act with it from Python "
+            f"(zest_rl.agents.load_policy), or hand the data to other code: zest export {dataset_id}"
+        )
     scored = score or uses_online_scores(policy, config)
     if scored and not (run / SCORER_FILE).exists():
         raise BadInput(

@@ -78,13 +78,14 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
     """Read a dataset as transitions, one dict of equally long arrays per episode.
 
     Args:
-        dataset_id: any dataset with flat observations.
+        dataset_id: any dataset with numbers among its observations.
         rewards: how its rewards are handed on.
 
     Returns:
         observations, next_observations (T, obs_dim), actions (T, act_dim), rewards (T,) float32; terminals, timeouts
-        (T,) bool; and where they are recorded, zest_score, gt_reward (T,) float32 after the action, and
-        gt_episode_success (T,) bool, of the whole episode.
+        (T,) bool; and where they are recorded, zest_score, gt_reward (T,) float32 after the action,
+        gt_episode_success (T,) bool, of the whole episode, and source_reward (T,) float32, which another robot's
+        dataset came with. A Dict of observations is flattened (`zest_rl.observations.numbers`).
 
     Raises:
         BadInput: no such dataset, the rewards cannot be normalised, or are differences already.
@@ -99,6 +100,9 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
         scores = data.read_scores(dataset_id)
         before = [float(score[0]) for score in scores]
         extras["zest_score"] = [score[1:] for score in scores]
+        source = data.read_source_rewards(dataset_id)
+        if source is not None:
+            extras["source_reward"] = source
     if data.has_ground_truth(dataset_id):
         truth = data.read_ground_truth(dataset_id)
         extras["gt_reward"] = [episode.rewards for episode in truth]

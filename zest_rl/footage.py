@@ -70,15 +70,15 @@ def read_clip(path: Path, n_frames: int) -> list[Frame]:
     if n_frames < 2:
         raise BadInput(f"a clip needs at least 2 frames, its first and its last, got {n_frames}")
     if path.is_dir():
-        pictures = sorted(list_images(path), key=_by_number)
+        pictures = sorted(list_images(path), key=by_number)
         frames = [read_image(pictures[i]) for i in evenly_spaced(len(pictures), n_frames)]
     elif not path.is_file():
         raise BadInput(f"{path} is not a file; give a video or a folder of pictures")
     else:
         try:
-            n = sum(1 for _ in _decoded(path))  # what the file says of its length may not be what is decoded
+            n = sum(1 for _ in decoded(path))  # what the file says of its length may not be what is decoded
             wanted = set(evenly_spaced(n, n_frames).tolist())
-            frames = [frame for i, frame in enumerate(_decoded(path)) if i in wanted]
+            frames = [frame for i, frame in enumerate(decoded(path)) if i in wanted]
         except (OSError, RuntimeError, ValueError, IndexError) as error:
             reason = " ".join(str(error).split())[:200]
             raise BadInput(f"{path} cannot be read as a video ({reason}); copy it, or convert it to MP4") from error
@@ -87,12 +87,13 @@ def read_clip(path: Path, n_frames: int) -> list[Frame]:
     return frames
 
 
-def _by_number(path: Path) -> list[int | str]:
+def by_number(path: Path) -> list[int | str]:
     """Order frame2 before frame10."""
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
 
 
-def _decoded(path: Path) -> Iterator[Frame]:
+def decoded(path: Path) -> Iterator[Frame]:
+    """Yield all frames of a video, each as it is stored, (H, W, 3) uint8 RGB; raises what imageio raises."""
     as_stored = ["-fps_mode", "passthrough"]  # else frames are repeated or dropped to a constant rate
     with imageio.get_reader(path, "ffmpeg", output_params=as_stored) as video:
         reader: Any = video

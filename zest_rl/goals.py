@@ -160,6 +160,24 @@ def read_goal(spec: str, task: Task, scene: tuple[NDArray[np.uint8], NDArray[np.
     return read_text(spec) if folder is None else read_folder(folder, spec)
 
 
+def read_free_goal(spec: str) -> GoalSpec:
+    """Read a goal spec that needs no task: a folder, or two sentences.
+
+    Raises:
+        BadInput: the spec is one of those of the kitchen, or what it names cannot be read.
+    """
+    if spec.startswith(TEXT):
+        return read_text(spec)
+    folder = Path(spec).expanduser()
+    if spec in (SAME_SCENE, DRAWINGS, OWN_TEXT) or spec.startswith(VISUAL_TASKS) or not folder.exists():
+        kitchen = f"{SAME_SCENE!r}, {DRAWINGS!r}, 'text' and '{VISUAL_TASKS}…' are of zest/Kitchen-v1's tasks alone"
+        raise BadInput(
+            f"frames from elsewhere need a goal of their own, got {spec!r} ({kitchen}); give --goal a folder with "
+            "init/ and goal/ pictures, or 'text:closed drawer -> open drawer'"
+        )
+    return read_folder(folder)
+
+
 def embed_goal(goal: GoalSpec, embedder: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Embed the starts and the goals of a spec.
 

@@ -29,6 +29,7 @@ class Figure:
     meaning: str
     needs_truth: bool
     measure: Callable[[_Rewards], Estimate]
+    needs_states: bool = False
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,8 @@ class _Rewards:
     """(T,) per episode, as a trainer sees them."""
     scores: list[FloatArray]
     """(T,) per episode, of the frames after each action; the rewards, unless these are differences."""
-    states: list[NDArray[np.float64]]
-    """(T+1, nq) per episode, rounded as the frames were rendered."""
+    states: list[NDArray[np.float64]] | None
+    """(T+1, nq) per episode, rounded as the frames were rendered; None of other robots than the kitchen's."""
     truth: list[GroundTruth] | None
 
     @cached_property
@@ -58,6 +59,12 @@ class _Rewards:
         """The ground truth, which is there."""
         assert self.truth is not None
         return self.truth
+
+    @property
+    def known_states(self) -> list[NDArray[np.float64]]:
+        """The states, which are there."""
+        assert self.states is not None
+        return self.states
 
 
 FIGURES = (
@@ -119,13 +126,15 @@ FIGURES = (
         "Nothing to see",
         "share of frames that show what the first one shows",
         False,
-        lambda r: quality.share_still(r.states),
+        lambda r: quality.share_still(r.known_states),
+        needs_states=True,
     ),
     Figure(
         "Contradictory",
         "share of frames that score otherwise than an equal one of the same episode; 0 is right",
         False,
-        lambda r: quality.share_contradictory(r.scores, [episode[1:] for episode in r.states]),
+        lambda r: quality.share_contradictory(r.scores, [episode[1:] for episode in r.known_states]),
+        needs_states=True,
     ),
 )
 
@@ -136,10 +145,11 @@ class Inspection:
 
     dataset_id: str
     task: str
+    """Of the kitchen; of another robot, the dataset that was relabeled."""
     made: Mapping[str, Any]
     """How it was relabeled, as `zest_rl.relabel` left it."""
     figures: Mapping[str, Estimate]
-    """By the names of `FIGURES`; those that need ground truth are missing where there is none."""
+    """By the names of `FIGURES`; those that need ground truth or states are missing where there are none."""
     warnings: tuple[str, ...]
     over_time: Mapping[str, FloatArray]
     """Mean reward at each step (T,), of successes and failures; without ground truth, of all episodes."""
@@ -164,11 +174,11 @@ def inspect(dataset_id: str) -> Inspection:
     Raises:
         BadInput: no such dataset, it was not relabeled, or it has fewer than 3 episodes.
     """
-    made = data.read_metadata(dataset_id).get("zest", {}).get("relabel")
+    metadata = data.read_metadata(dataset_id)
+    made = metadata.get("zest", {}).get("relabel")
     if made is None:
         raise BadInput(f"dataset {dataset_id} holds no ZeST scores; run `zest relabel {dataset_id}` and inspect that")
-    scorer = made["scorer"]["config"]
-    views = Views(**scorer["views"])
+    views = None if data.is_foreign(metadata) else Views(**made["scorer"]["config"]["views"])
     step_rewards = [episode.rewards for episode in data.read_episodes(dataset_id)]
     if len(step_rewards) < MIN_EPISODES_TO_RANK:
         raise BadInput(
@@ -177,20 +187,21 @@ def inspect(dataset_id: str) -> Inspection:
     rewards = _Rewards(
         step_rewards,
         [score[1:] for score in data.read_scores(dataset_id)],
-        [canonical_states(states, views) for states in data.read_states(dataset_id)],
+        None if views is None else [canonical_states(states, views) for states in data.read_states(dataset_id)],
         data.read_ground_truth(dataset_id) if data.has_ground_truth(dataset_id) else None,
     )
     figures = {
         figure.name: figure.measure(rewards)
         for figure in FIGURES
-        if rewards.truth is not None or not figure.needs_truth
+        if (rewards.truth is not None or not figure.needs_truth)
+        and (rewards.states is not None or not figure.needs_states)
     }
     found = warnings(step_rewards, figures)
     if made["shuffle"] is not None:
         found.insert(0, "These are the scores of other episodes: the dataset was relabeled with --shuffle.")
     return Inspection(
         dataset_id,
-        views.task,
+        str(made["source"]) if views is None else views.task,
         made,
         figures,
         tuple(found),
@@ -212,7 +223,7 @@ def warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimate]) -> 
     found = []
     if np.ptp(quality.returns_of(rewards)) == 0:
         found.append("All episodes have the same return: there is nothing to condition a Decision Transformer on.")
-    if figures["Contradictory"].value >= CONTRADICTORY:
+    if "Contradictory" in figures and figures["Contradictory"].value >= CONTRADICTORY:
         found.append(
             f"{figures['Contradictory'].value:.0%} of the frames score otherwise than an equal frame of the same "
             "episode: these scores are not of these episodes (shuffled?)."
@@ -221,7 +232,7 @@ def warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimate]) -> 
         found.append("The number of the step alone tells the score: the reward is a clock, whatever the robot does.")
     if figures["Saturated"].value >= SATURATED:
         found.append("Nearly all frames score next to the lowest or the highest: most progress is not rewarded.")
-    if figures["Nothing to see"].value >= STILL:
+    if "Nothing to see" in figures and figures["Nothing to see"].value >= STILL:
         found.append("Most frames show what the first one shows: nothing moves, or the cameras do not see it.")
     rho = figures.get("Spearman ρ")
     if rho is not None and not rho.low > 0:  # also when it is NaN

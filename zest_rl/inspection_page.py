@@ -45,7 +45,7 @@ def _settings(inspection: Inspection) -> dict[str, Any]:
         "embedder": config["embedder"],
         "features": config["features"],
         "similarity": config["similarity"],
-        "views": config["views"]["n_views"],
+        "views": config["views"]["n_views"] if "views" in config else len(made["frames"]["views"]),
         "share of goals": config["goal_share"],
         "reward": made["reward"],
         "shuffled": "no" if made["shuffle"] is None else made["shuffle"],
@@ -93,7 +93,9 @@ def confusion_warnings(inspections: Sequence[Inspection], means: FloatArray) -> 
 
 
 def look_at(inspection: Inspection, *, n_workers: int | None = None) -> dict[str, Look]:
-    """Look at the episodes with the highest and the lowest return: "best" and "worst"; none where scores were shuffled.
+    """Look at the episodes with the highest and the lowest return: "best" and "worst".
+
+    None where scores were shuffled, or where the frames were not rendered by us.
 
     Args:
         inspection: of a dataset.
@@ -102,7 +104,7 @@ def look_at(inspection: Inspection, *, n_workers: int | None = None) -> dict[str
     Raises:
         ZestError: the scorer is gone, or was made with another embedder or renderer than the ones here.
     """
-    if inspection.made["shuffle"] is not None:
+    if inspection.made["shuffle"] is not None or "frames" in inspection.made:
         return {}
     scorer = Scorer.load(data.dataset_path(inspection.dataset_id) / SCORER_FILE, n_workers=n_workers)
     states = data.read_states(inspection.dataset_id)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from zest_rl import artifacts, data, metrics
 from zest_rl.evaluation import Evaluation, evaluation_folder
-from zest_rl.goals import read_goal
+from zest_rl.goals import read_goal, read_text
 from zest_rl.images import list_images, read_image
 from zest_rl.relabel import GOAL_FOLDER
 from zest_rl.report import EpisodePanel, GoalPanel, Scatter
@@ -42,7 +42,8 @@ def goal_panel(name: str, dataset_id: str, scatter: Scatter | None = None) -> Go
     if folder.is_dir():
         start, goal = (tuple(read_image(path) for path in list_images(folder / part)) for part in ("init", "goal"))
         return GoalPanel(name, start, goal, *ranking)
-    sentences = read_goal(config["goal"], get_task(config["views"]["task"]))
+    foreign = "views" not in config
+    sentences = read_text(config["goal"]) if foreign else read_goal(config["goal"], get_task(config["views"]["task"]))
     kept = range(len(sentences.goals)) if made["kept_goals"] is None else made["kept_goals"]
     return GoalPanel(name, sentences.starts, tuple(sentences.goals[k] for k in kept), *ranking)
 

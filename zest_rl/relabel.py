@@ -14,6 +14,7 @@ from PIL import Image
 from zest_rl import artifacts, data
 from zest_rl.data_writer import write_relabeled
 from zest_rl.errors import BadInput, nearest
+from zest_rl.goals import GoalSpec
 from zest_rl.scorer import Scorer, ScorerConfig
 from zest_rl.types import FloatArray
 
@@ -145,9 +146,13 @@ def relabel(
 
 
 def _leave_scorer(folder: Path, scorer: Scorer) -> None:
-    """Leave the scorer, for online scores, and small pictures of the goal, for reports, in a dataset's folder."""
+    """Leave the scorer, for online scores, and the goal in a dataset's folder."""
     scorer.save(folder / SCORER_FILE)
-    goal = scorer.goal
+    leave_goal(folder, scorer.goal)
+
+
+def leave_goal(folder: Path, goal: GoalSpec | None) -> None:
+    """Leave small pictures of the goal, for reports, in a dataset's folder; nothing of sentences."""
     if goal is None or goal.is_text:
         return
     for part, pictures in (("init", goal.starts), ("goal", goal.goals)):

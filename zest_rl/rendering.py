@@ -38,6 +38,7 @@ N_QPOS = 30
 N_ROBOT_QPOS = 9
 """The leading entries of qpos: 7 arm joints and 2 fingers; the rest belongs to objects."""
 
+_MORE_GEOMS = 1000  # tendons and the like, which are drawn but are no geoms of the model
 _RENDERER_VERSION = 1  # raise it with any change of this file that changes a pixel: cached embeddings depend on it
 _KITCHEN = Path("envs", "assets", "kitchen_franka")
 _ROBOT_ROOT = "panda0_link0"
@@ -126,6 +127,46 @@ def relevant_qpos(config: RenderConfig) -> slice:
     return slice(0 if config.robot else N_ROBOT_QPOS, N_QPOS)
 
 
+class Canvas:
+    """Draws a model from fixed cameras, without shadows and reflections; use it from the thread that made it."""
+
+    def __init__(self, model: mujoco.MjModel, cameras: tuple[mujoco.MjvCamera, ...], size: int) -> None:
+        """Open a GL context for square frames of `size` pixels.
+
+        Raises:
+            ZestError: no GL backend works.
+        """
+        self._model, self._cameras = model, cameras
+        self._rect = mujoco.MjrRect(0, 0, size, size)
+        self._option, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
+        self._scene = mujoco.MjvScene(model, maxgeom=2 * model.ngeom + model.nsite + _MORE_GEOMS)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._gl, self._context = _open_gl(model, size)
+
+    def hide_sky(self) -> None:
+        """Leave the background black; a model's sky may hold random specks."""
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = False
+
+    def draw(self, data: mujoco.MjData) -> NDArray[np.uint8]:
+        """Draw one state, whose positions in the world are computed: (V, H, W, 3) uint8 RGB."""
+        self._gl.make_current()
+        frames = np.empty((len(self._cameras), self._rect.height, self._rect.width, 3), np.uint8)
+        for frame, camera in zip(frames, self._cameras, strict=True):
+            mujoco.mjv_updateScene(
+                self._model, data, self._option, self._perturb, camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
+            )
+            mujoco.mjr_render(self._rect, self._scene, self._context)
+            mujoco.mjr_readPixels(frame, None, self._rect, self._context)
+        return np.ascontiguousarray(frames[:, ::-1])  # GL counts rows from the bottom
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()
+
+
 class StateRenderer:
     """Draws kitchen states from fixed cameras. A context manager; use it from the thread and process that made it.
 
@@ -144,13 +185,7 @@ class StateRenderer:
         self._relevant = relevant_qpos(config)
         self._model = _render_model(config)
         self._data = mujoco.MjData(self._model)
-        self._cameras = tuple(_mujoco_camera(camera) for camera in cameras)
-        self._rect = mujoco.MjrRect(0, 0, config.size, config.size)
-        self._option, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
-        self._scene = mujoco.MjvScene(self._model, maxgeom=2 * self._model.ngeom)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-        self._gl, self._context = _open_gl(self._model, config.size)
+        self._canvas = Canvas(self._model, tuple(_mujoco_camera(camera) for camera in cameras), config.size)
 
     def render(self, qpos: NDArray[np.float64]) -> NDArray[np.uint8]:
         """Draw one state.
@@ -172,15 +207,7 @@ class StateRenderer:
         self._data.qpos[:] = qpos[self._relevant]
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
-        self._gl.make_current()
-        frames = np.empty((len(self._cameras), self._rect.height, self._rect.width, 3), np.uint8)
-        for frame, camera in zip(frames, self._cameras, strict=True):
-            mujoco.mjv_updateScene(
-                self._model, self._data, self._option, self._perturb, camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
-            )
-            mujoco.mjr_render(self._rect, self._scene, self._context)
-            mujoco.mjr_readPixels(frame, None, self._rect, self._context)
-        return np.ascontiguousarray(frames[:, ::-1])  # GL counts rows from the bottom
+        return self._canvas.draw(self._data)
 
     def with_joint(self, qpos: NDArray[np.float64], joint: str, position: float) -> NDArray[np.float64]:
         """Return a copy of a state (30,) with one of the objects' joints moved to `position` (rad or m).
@@ -201,9 +228,7 @@ class StateRenderer:
 
     def close(self) -> None:
         """Free the GL context; the renderer cannot draw any more."""
-        self._gl.make_current()
-        self._context.free()
-        self._gl.free()
+        self._canvas.close()
 
     def __enter__(self) -> Self:
         return self

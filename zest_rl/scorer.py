@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl import artifacts
 from zest_rl.embed import EmbedConfig, StateEmbedder
-from zest_rl.embedders import Precision
+from zest_rl.embedders import Embedder, Precision
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.frames import Views, canonical_states, scene_pair
 from zest_rl.goals import SAME_SCENE, GoalSpec, embed_goal, read_goal
@@ -51,6 +51,54 @@ class ScorerConfig:
     def from_dict(cls, values: dict[str, Any]) -> Self:
         """Rebuild from ``dataclasses.asdict``."""
         return cls(**{**values, "views": Views(**values["views"])})
+
+
+class Scoring(Protocol):
+    """What a score depends on besides frames, goal and embedder: the fields of a scorer's config that say how."""
+
+    @property
+    def features(self) -> Features:
+        """See `zest_rl.scores`."""
+
+    @property
+    def similarity(self) -> Similarity:
+        """See `zest_rl.scores`."""
+
+    @property
+    def goal_share(self) -> float:
+        """Share of the goals that are used."""
+
+
+def how_scored(config: Scoring) -> list[Any]:
+    """What of a config changes a score, for hashes of it; JSON-ready."""
+    named = {"features": config.features, "similarity": config.similarity, "goal_share": config.goal_share}
+    rule = [] if config.goal_share == 1 else ["by last frames"]
+    return [named, *rule, *(f"{name} {number}" for name, number in NUMBERS.items() if name == config.features)]
+
+
+def goals_near(ends: Iterable[FloatArray], starts: FloatArray, goals: FloatArray, config: Scoring) -> NDArray[np.intp]:
+    """Return the share ``config.goal_share`` of the goals (at least one) that the episodes end nearest to.
+
+    The rule needs no ground truth ("goal images with high similarity", Cui et al. §5.3): kept are the goals by which
+    the last frames of the episodes score highest on average. It takes the data to lead somewhere: on behaviour without
+    intention it picks what resembles its end.
+
+    Args:
+        ends: (2, V, D) embeddings of the first and the last frame, per episode.
+        starts: see `score_views`.
+        goals: see `score_views`.
+        config: how frames are scored.
+
+    Returns:
+        Indices of the goals, in their order.
+    """
+    n_goals = goals.shape[-2]
+    at_end = np.zeros(n_goals)
+    for frames in ends:
+        for k in range(n_goals):
+            at_end[k] += score_views(frames, starts, goals[..., k : k + 1, :], config.features, config.similarity)[-1]
+    n_kept = max(1, round(config.goal_share * n_goals))
+    return np.sort(np.argsort(-at_end, kind="stable")[:n_kept])
 
 
 class Scorer:
@@ -100,12 +148,7 @@ class Scorer:
         goal = read_goal(config.goal, task, scene)
         device = options.get("device", "auto")
         embedder = EmbedConfig(config.views, config.embedder, config.precision, device).load_embedder()
-        if goal.is_text and not embedder.reads_text:
-            raise BadInput(
-                f"goal {goal.name!r} is a sentence, but embedder {config.embedder!r} reads pictures only; use one that "
-                "reads text, e.g. open_clip:ViT-B-32/openai, or a goal of pictures"
-            )
-        starts, goals = _embed_goal_cached(goal, embedder)
+        starts, goals = embed_goal_cached(goal, embedder)
         scorer = cls(config, starts, goals, goal.fingerprint(), **options)
         scorer.goal = goal
         return scorer
@@ -145,9 +188,7 @@ class Scorer:
     ) -> NDArray[np.intp]:
         """Keep the share ``config.goal_share`` of the goals (at least one) and forget the others.
 
-        The rule needs no ground truth ("goal images with high similarity", Cui et al. §5.3): kept are the goals by
-        which the last frames of the episodes score highest on average. It takes the data to lead somewhere: on
-        behaviour without intention it picks what resembles its end.
+        The rule is that of `goals_near`.
 
         Args:
             states: (T+1, nq) simulator positions per episode.
@@ -156,15 +197,8 @@ class Scorer:
         Returns:
             Indices of the goals that are kept, in their order.
         """
-        n_goals = self.goals.shape[-2]
-        n_kept = max(1, round(self.config.goal_share * n_goals))
-        at_end = np.zeros(n_goals)
-        for frames, inverse in self._frames(states, on_progress):
-            ends = frames[[0, 1 + inverse[-1]]]
-            for k in range(n_goals):
-                goal = self.goals[..., k : k + 1, :]
-                at_end[k] += score_views(ends, self.starts, goal, self.config.features, self.config.similarity)[-1]
-        kept = np.sort(np.argsort(-at_end, kind="stable")[:n_kept])
+        ends = (frames[[0, 1 + inverse[-1]]] for frames, inverse in self._frames(states, on_progress))
+        kept = goals_near(ends, self.starts, self.goals, self.config)
         self.keep_goals(kept)
         return kept
 
@@ -258,11 +292,8 @@ class Scorer:
     def fingerprint(self) -> str:
         """Hash of all that a score depends on; names of files and folders are left out."""
         described = self.describe()
-        config = {k: v for k, v in described["config"].items() if k in ("features", "similarity", "goal_share")}
-        rule = [] if self.config.goal_share == 1 else ["by last frames"]
-        rule += [f"{name} {number}" for name, number in NUMBERS.items() if name == self.config.features]
         hashes = [described[k] for k in ("goal_sha256", "embedder_sha256", "views_sha256")]
-        return artifacts.hash_json([config, *rule, hashes])
+        return artifacts.hash_json([*how_scored(self.config), hashes])
 
     def save(self, path: Path) -> None:
         """Write the goal's embeddings and the config as one safetensors file."""
@@ -300,7 +331,17 @@ class Scorer:
         return scorer
 
 
-def _embed_goal_cached(goal: GoalSpec, embedder: Any) -> tuple[FloatArray, FloatArray]:
+def embed_goal_cached(goal: GoalSpec, embedder: Embedder) -> tuple[FloatArray, FloatArray]:
+    """Embed a goal's starts and goals, through a cache: see `embed_goal`.
+
+    Raises:
+        BadInput: the goal is a sentence and the embedder reads pictures only.
+    """
+    if goal.is_text and not embedder.reads_text:
+        raise BadInput(
+            f"goal {goal.name!r} is a sentence, but embedder {embedder.uri!r} reads pictures only; use one that "
+            "reads text, e.g. open_clip:ViT-B-32/openai, or a goal of pictures"
+        )
     digest = artifacts.hash_json([goal.fingerprint(), embedder.fingerprint])
     path = artifacts.cache_dir() / "goals" / f"{digest[:20]}.npz"
     cached = read_arrays(path)

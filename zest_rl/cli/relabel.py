@@ -17,10 +17,16 @@ class Config:
     """Relabel a dataset: rewards become the similarity of the change in its frames to the change in the goal."""
 
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
-    """Minari dataset with recorded simulator state."""
+    """Minari dataset: of zest/Kitchen-v1, or of any robot, with pictures among its observations or recorded
+    MuJoCo states; or the path of a robomimic HDF5 file or a LeRobot v3 folder."""
+    frames: tuple[str, ...] = ()
+    """Where the frames are: entries with pictures (observations/KEY), or folders with episode_0.mp4, … or episode_0/
+    with pictures; several are views that are averaged. Default: the only pictures there are, else recorded states."""
+    camera: tuple[str, ...] = ()
+    """Cameras of the environment's model, to render recorded states from, averaged as views. Default: its own."""
     goal: str = "same-scene"
-    """Folder with init/ and goal/ pictures, "drawings", "same-scene", "text" (the task's own sentences), or
-    "text:closed microwave -> open microwave"."""
+    """Folder with init/ and goal/ pictures, or "text:closed microwave -> open microwave"; and for the kitchen
+    "drawings", "same-scene", or "text" (the task's own sentences)."""
     embedder: str = "efficientnet-lite0"
     """Frozen network: efficientnet-lite0, open_clip:MODEL/PRETRAINED, torchvision:resnet50, timm:NAME, …@/path,
     transformers:/folder, or a family that another package registers."""
@@ -57,17 +63,38 @@ class Config:
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
-    """Render, embed, score, write."""
+    """Render or read, embed, score, write."""
     import time
 
     import numpy as np
 
     from zest_rl import data
+    from zest_rl.sources import is_kitchen
+
+    started = time.monotonic()
+    frames_are_rendered = not (config.frames or config.camera) and is_kitchen(config.dataset)
+    result = (_from_states if frames_are_rendered else _from_frames)(config, ui)
+    if result.pop("already_there"):
+        ui.say(f"{result['dataset']} is there already, nothing to do")
+    returns = np.array([rewards.sum() for rewards in data.read_rewards(result["dataset"])])
+    if np.ptp(returns) == 0:
+        ui.warn("all episodes have the same return: this goal and embedder tell nothing apart")
+    return {
+        **result,
+        "return_min": float(returns.min()),
+        "return_max": float(returns.max()),
+        "seconds": round(time.monotonic() - started, 2),
+        "next": f"zest train dt {result['dataset']}",
+    }
+
+
+def _from_states(config: Config, ui: Ui) -> dict[str, Any]:
+    """Relabel a dataset of the kitchen."""
+    from zest_rl import data
     from zest_rl.frames import Views
     from zest_rl.relabel import relabel
     from zest_rl.scorer import ScorerConfig
 
-    started = time.monotonic()
     views = Views(
         task=data.task_name(config.dataset),
         n_views=config.views,
@@ -93,19 +120,47 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
             n_workers=config.n_workers,
             on_progress=on_progress,
         )
-    if relabeled.already_there:
-        ui.say(f"{relabeled.dataset_id} is there already, nothing to do")
-    returns = np.array([episode.rewards.sum() for episode in data.read_episodes(relabeled.dataset_id)])
-    if np.ptp(returns) == 0:
-        ui.warn("all episodes have the same return: this goal and embedder tell nothing apart")
     return {
         "dataset": relabeled.dataset_id,
         "path": str(relabeled.path),
         "n_frames": relabeled.n_frames,
         "n_distinct_states_embedded": relabeled.scorer.states.n_embedded,
         "n_still_frames": relabeled.n_still,
-        "return_min": float(returns.min()),
-        "return_max": float(returns.max()),
-        "seconds": round(time.monotonic() - started, 2),
-        "next": f"zest train dt {relabeled.dataset_id}",
+        "already_there": relabeled.already_there,
+    }
+
+
+def _from_frames(config: Config, ui: Ui) -> dict[str, Any]:
+    """Relabel a dataset of another robot, or the kitchen's by other frames."""
+    from zest_rl.frame_scorer import FrameScorerConfig
+    from zest_rl.relabel_frames import relabel_frames
+    from zest_rl.sources import open_source
+
+    own = [name for name in ("views", "show_robot", "tolerance") if getattr(config, name) != getattr(Config, name)]
+    if own:
+        flags = " and ".join(f"--{name.replace('_', '-')}" for name in own)
+        raise BadInput(f"{flags} belong to the kitchen's own renderer, not to frames from elsewhere; leave them out")
+    source = open_source(config.dataset, frames=config.frames, cameras=config.camera)
+    scorer_config = FrameScorerConfig(
+        config.goal, config.embedder, config.features, config.similarity, config.precision, config.goal_share
+    )
+    ui.say(f"frames: {', '.join(source.frames.views)}")
+    with progress_in_parts(ui, "reading and embedding") as on_progress:
+        relabeled = relabel_frames(
+            source,
+            scorer_config,
+            reward=config.reward,
+            shuffle=config.shuffle,
+            device=config.device,
+            n_workers=config.n_workers,
+            on_progress=on_progress,
+        )
+    return {
+        "dataset": relabeled.dataset_id,
+        "path": str(relabeled.path),
+        "n_frames": relabeled.n_frames,
+        "views": list(source.frames.views),
+        "n_episodes_embedded": relabeled.n_embedded,
+        "n_still_frames": relabeled.n_still,
+        "already_there": relabeled.already_there,
     }

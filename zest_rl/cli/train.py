@@ -54,19 +54,21 @@ def _with_arguments(agent: str, config: type[Any]) -> type[Any]:
 def run(config: Arguments, ui: Ui) -> dict[str, Any]:
     """Train, or go on training."""
     from zest_rl.agents import AGENTS
+    from zest_rl.data import is_foreign
 
     agent_class = AGENTS[config.agent].config
     agent_config = agent_class(**{field.name: getattr(config, field.name) for field in fields(agent_class)})
     name = config.dataset.split("/")[-1]
     run_dir = config.run_dir or Path("runs") / f"{name}-{config.agent}-seed{config.seed}"
     meta = train_on_dataset(config, agent_config, run_dir, ui)
+    quoted = shlex.quote(str(run_dir))
     return {
         "run": str(run_dir),
         "agent": config.agent,
         "n_params": meta["n_params"],
         "n_updates": meta["n_updates"],
         "train_seconds": meta["train_seconds"],
-        "next": f"zest evaluate {shlex.quote(str(run_dir))}",
+        "next": f"zest export {config.dataset}" if is_foreign(meta["dataset"]) else f"zest evaluate {quoted}",
     }
 
 

@@ -1,0 +1,161 @@
+"""Observations as Minari, robomimic and others keep them in HDF5: which entries are pictures, and which are numbers.
+
+A Dict or Tuple space is a group, each entry a dataset with one row per step; entries go by their paths within the
+group. A *picture* is (H, W) or (H, W, C) or (C, H, W) with 1 or 3 channels and sides of at least `MIN_SIDE` pixels, as
+uint8 or as floats in [0, 1]; or one JPEG file per step, which Minari makes of uint8 pictures by default (lossy).
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from zest_rl.errors import BadInput
+from zest_rl.types import FloatArray, Frame
+
+MIN_SIDE = 8
+"""Smaller arrays of this form are matrices, not pictures."""
+ROWS = 64
+"""Steps whose pictures are held in memory at a time."""
+_JPEG = bytes((0xFF, 0xD8, 0xFF))
+
+
+def entries(node: h5py.Group | h5py.Dataset, prefix: str = "") -> dict[str, h5py.Dataset]:
+    """Return the datasets at or below a node by their paths, sorted; a node that is one itself goes by ""."""
+    if isinstance(node, h5py.Dataset):
+        return {prefix: node}
+    found: dict[str, h5py.Dataset] = {}
+    for name in sorted(node):
+        found |= entries(node[name], f"{prefix}/{name}" if prefix else name)
+    return found
+
+
+def n_channels(entry: h5py.Dataset) -> int | None:
+    """Return 1 or 3 for pictures (3 for JPEG files), None for anything else."""
+    if _is_jpeg(entry):
+        return 3
+    return None if entry.dtype.kind not in "uf" else _channels(entry.shape[1:])
+
+
+def _is_jpeg(entry: h5py.Dataset) -> bool:
+    ragged = h5py.check_vlen_dtype(entry.dtype)
+    if ragged is not None:
+        return bool(ragged == np.uint8) and len(entry) > 0 and bytes(entry[0][:3]) == _JPEG
+    return entry.dtype == np.uint8 and entry.ndim == 2 and len(entry) > 0 and bytes(entry[0, :3]) == _JPEG
+
+
+def _channels(shape: tuple[int, ...]) -> int | None:
+    if len(shape) == 2:
+        return 1 if min(shape) >= MIN_SIDE else None
+    if len(shape) != 3:
+        return None
+    for channels, sides in ((shape[2], shape[:2]), (shape[0], shape[1:])):
+        if channels in (1, 3) and min(sides) >= MIN_SIDE:
+            return channels
+    return None
+
+
+def read_pictures(entry: h5py.Dataset, rows: slice) -> list[Frame]:
+    """Read some rows of an entry of pictures as (H, W, 3) uint8 RGB.
+
+    Raises:
+        BadInput: the entry holds no pictures, or floats that are not in [0, 1].
+    """
+    if n_channels(entry) is None:
+        raise BadInput(
+            f"{entry.name} holds no pictures (got shape {entry.shape[1:]} and dtype {entry.dtype} per step); they must "
+            "be (H, W), (H, W, C) or (C, H, W) with 1 or 3 channels, uint8 or floats in [0, 1]"
+        )
+    stored = entry[rows]
+    if _is_jpeg(entry):
+        return [np.asarray(Image.open(io.BytesIO(bytes(row))).convert("RGB")) for row in stored]
+    return [as_frame(picture, entry.name) for picture in stored]
+
+
+def as_frame(picture: NDArray[Any], what: str) -> Frame:
+    """Turn a picture of any of the forms above into (H, W, 3) uint8 RGB; `what` names it in an error."""
+    if picture.dtype.kind == "f":
+        if not (picture.min() >= 0 and picture.max() <= 1):  # also when it is NaN
+            raise BadInput(
+                f"{what}: pictures of floats must be in [0, 1], got {picture.min():.4g} to {picture.max():.4g}; "
+                "scale them, or store uint8"
+            )
+        picture = np.round(picture * 255)
+    elif picture.dtype != np.uint8:
+        raise BadInput(f"{what}: pictures of integers must be uint8, got {picture.dtype}; store uint8")
+    if picture.ndim == 2:
+        picture = picture[:, :, None]
+    elif picture.shape[2] not in (1, 3) or min(picture.shape[:2]) < MIN_SIDE:
+        picture = np.moveaxis(picture, 0, 2)
+    return np.ascontiguousarray(np.broadcast_to(picture, (*picture.shape[:2], 3)), dtype=np.uint8)
+
+
+def choose_pictures(found: dict[str, int | None], wanted: Iterable[str], where: str, prefix: str = "") -> list[str]:
+    """Choose the entries whose pictures are the frames: those that are asked for, or the only one.
+
+    Args:
+        found: entry → its number of channels, None where it is no picture.
+        wanted: their names, with or without `prefix`; empty: the only one in colour, else the only one.
+        where: names the dataset in an error.
+        prefix: what stands before each name for the user, such as ``observations``.
+
+    Raises:
+        BadInput: no such entry, none at all, or several; the message lists them.
+    """
+    shown = {name: "/".join(part for part in (prefix, name) if part) for name, n in found.items() if n is not None}
+    listing = ", ".join(shown.values()) or "(none)"
+    chosen = []
+    for key in wanted:
+        name = next((name for name, full in shown.items() if key in (name, full)), None)
+        if name is None:
+            raise BadInput(f"{where} has no pictures at {key!r}; entries with pictures: {listing}")
+        chosen.append(name)
+    if chosen:
+        return chosen
+    colour = [name for name in shown if found[name] == 3]
+    candidates = colour or list(shown)
+    if len(candidates) != 1:
+        problem = "no entry with pictures" if not candidates else f"several entries with pictures: {listing}"
+        raise BadInput(
+            f"{where} has {problem}; "
+            + ("choose with --frames KEY, or several keys to average them as views" if candidates else "see --help")
+        )
+    return candidates
+
+
+def stored_rows(entry: h5py.Dataset) -> Iterator[NDArray[Any]]:
+    """Yield what an entry holds as it is stored, `ROWS` steps at a time."""
+    if h5py.check_vlen_dtype(entry.dtype) is not None:
+        yield from (entry[row] for row in range(len(entry)))
+    else:
+        yield from (entry[row : row + ROWS] for row in range(0, len(entry), ROWS))
+
+
+def numbers(node: h5py.Group | h5py.Dataset) -> FloatArray:
+    """Flatten the numbers of an observation: one row per step.
+
+    The entries of a Dict follow each other in the alphabetical order of their paths, as Gymnasium's ``flatten`` has
+    them; pictures and text are left out.
+
+    Returns:
+        (T+1, n) float32.
+
+    Raises:
+        BadInput: there are no numbers.
+    """
+    columns = [
+        np.asarray(entry[()], dtype=np.float32).reshape(len(entry), -1)
+        for entry in entries(node).values()
+        if n_channels(entry) is None and entry.dtype.kind in "biuf" and entry.ndim > 0
+    ]
+    if not columns:
+        raise BadInput(f"{node.name} holds pictures only; a policy here needs numbers to act on")
+    if len({len(column) for column in columns}) > 1:
+        raise BadInput(f"the entries of {node.name} must be equally long, got {[len(c) for c in columns]}")
+    return np.concatenate(columns, axis=1)

@@ -1,0 +1,99 @@
+"""Frames from anywhere → scores → a relabeled Minari dataset: `zest_rl.relabel` for robots other than our kitchen.
+
+What is written is the same, but for the rewards that the dataset came with: ``infos/source/reward`` keeps them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from zest_rl import artifacts, data
+from zest_rl.data_writer import write_scored
+from zest_rl.frame_scorer import FrameScorer, FrameScorerConfig
+from zest_rl.relabel import Reward, leave_goal, relabeled_id, rewards_from_scores, shuffled
+from zest_rl.sources.base import Source
+
+
+@dataclass(frozen=True)
+class RelabeledFrames:
+    """What `relabel_frames` made or found."""
+
+    dataset_id: str
+    path: Path
+    n_frames: int
+    """Scored frames of one view: T + 1 per episode."""
+    n_embedded: int
+    """Episodes that were not in the cache."""
+    n_still: int | None
+    """Frames without any change against their first frame; None when the dataset was there already."""
+    already_there: bool
+
+
+def relabel_frames(
+    source: Source,
+    config: FrameScorerConfig,
+    *,
+    reward: Reward = "level",
+    shuffle: int | None = None,
+    device: str = "auto",
+    n_workers: int | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> RelabeledFrames:
+    """Write a copy of a dataset whose rewards are ZeST scores; the rewards that it came with are kept, unread.
+
+    Args:
+        source: episodes and their frames.
+        config: the scorer.
+        reward: the level of the score at each step, or its change.
+        shuffle: null control: give each episode the scores of another one, drawn with this seed.
+        device: where the embedder runs.
+        n_workers: processes that read and embed, default one per core.
+        on_progress: called with (episodes embedded, episodes in all).
+
+    Raises:
+        BadInput: the goal, the embedder or the frames do not fit.
+        ZestError: the disk is full or read-only; nothing is left behind but finished embeddings.
+    """
+    trajectories = source.trajectories
+    scorer = FrameScorer(config, device=device, n_workers=n_workers)
+    digests = [source.frames.digest(episode) for episode in range(len(trajectories.n_steps))]
+    fingerprint = trajectories.fingerprint()
+    digest = artifacts.hash_json([fingerprint, digests, scorer.fingerprint(), reward, shuffle])
+    target_id = relabeled_id(trajectories.dataset_id, digest)
+    path = data.dataset_path(target_id)
+    n_frames = sum(trajectories.n_steps) + len(trajectories.n_steps)
+    if data.exists(target_id):
+        return RelabeledFrames(target_id, path, n_frames, 0, None, already_there=True)
+    with artifacts.lock(path):
+        if data.exists(target_id):  # an equal call that ran at the same time
+            return RelabeledFrames(target_id, path, n_frames, 0, None, already_there=True)
+        scorer.embed(source, digests, on_progress)
+        kept = scorer.select_goals(source, digests) if config.goal_share < 1 else None
+        scores, n_still = scorer.score_episodes(source, digests)
+        if shuffle is not None:
+            scores = shuffled(scores, shuffle)
+        write_scored(
+            trajectories,
+            target_id,
+            [rewards_from_scores(score, reward) for score in scores],
+            scores,
+            description=(f"Rewards are scores ({config.similarity}+{config.features}, {reward}) by {config.embedder}."),
+            zest={
+                "relabel": {
+                    "source": trajectories.dataset_id,
+                    "source_sha256": fingerprint,
+                    "frames": source.frames.describe(),
+                    "frames_sha256": artifacts.hash_json(digests),
+                    "reward": reward,
+                    "shuffle": shuffle,
+                    "kept_goals": None if kept is None else kept.tolist(),
+                    "scorer": scorer.describe(),
+                    "n_still_frames": n_still,
+                    "provenance": artifacts.provenance(),
+                }
+            },
+            extra=lambda folder: leave_goal(folder, scorer.goal),
+        )
+    return RelabeledFrames(target_id, path, n_frames, scorer.n_embedded, n_still, already_there=False)

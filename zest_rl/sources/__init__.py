@@ -1,0 +1,95 @@
+"""Robot datasets of any kind → episodes and frames. One kind of input is one file here; `open_source` tells them apart.
+
+| input | episodes | frames |
+|---|---|---|
+| Minari dataset with pictures among its observations | copied | those (`pictures`) |
+| Minari dataset with recorded MuJoCo states, or with `--camera NAME` | copied | rendered from the model (`states`) |
+| any of these with `--frames FOLDER …` | | videos or pictures in a folder (`clips`) |
+| robomimic's HDF5 | imported (`robomimic`) | its pictures |
+| LeRobot v3 folder | imported (`lerobot`) | its videos |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from zest_rl import data
+from zest_rl.data_writer import Copied, Trajectories
+from zest_rl.errors import BadInput
+from zest_rl.observations import choose_pictures
+from zest_rl.sources.base import Frames, Source
+from zest_rl.sources.clips import find_clips
+from zest_rl.sources.pictures import Pictures, picture_entries
+
+__all__ = ["Frames", "Source", "is_kitchen", "open_source"]
+
+
+def is_kitchen(dataset: str) -> bool:
+    """Whether a dataset is of zest/Kitchen-v1, whose frames `zest_rl.relabel` renders."""
+    return not _is_path(dataset) and data.kitchen_task(dataset) is not None
+
+
+def _is_path(dataset: str) -> bool:
+    path = Path(dataset).expanduser()
+    return path.exists() and not (data.DATASET_ID.fullmatch(dataset) and data.exists(dataset))
+
+
+def open_source(dataset: str, *, frames: Sequence[str] = (), cameras: Sequence[str] = ()) -> Source:
+    """Find a dataset's episodes and their frames.
+
+    Args:
+        dataset: a Minari id, or the path of a robomimic file or a LeRobot folder.
+        frames: entries with pictures, or folders with videos, one per view; empty: the only pictures there are, else
+            the recorded states.
+        cameras: of the environment's model, one per view, to render the recorded states from.
+
+    Raises:
+        BadInput: no such dataset, or its frames cannot be found or told apart; the message says what there is.
+    """
+    if frames and cameras:
+        raise BadInput("--camera renders recorded states, --frames says where pictures are; give one of them")
+    folders = [Path(one).expanduser() for one in frames if Path(one).expanduser().is_dir()]
+    if folders and len(folders) < len(frames):
+        raise BadInput(f"--frames must be folders or entries of the dataset, not both; got {', '.join(frames)}")
+    keys = [] if folders else frames
+    found: Frames | None
+    trajectories: Trajectories
+    if _is_path(dataset):
+        if cameras:
+            raise BadInput("--camera renders the states of Minari datasets alone; leave it out")
+        trajectories, found = _open_path(Path(dataset).expanduser(), keys, with_frames=not folders)
+    else:
+        trajectories = Copied(dataset)
+        found = None if folders else _minari_frames(dataset, keys, cameras)
+    if folders:
+        found = find_clips(folders, len(trajectories.n_steps), dataset)
+    if found is None:
+        raise BadInput(f"{dataset} shows no frames; give --frames FOLDER with a video of each episode")
+    return Source(trajectories, found)
+
+
+def _open_path(path: Path, keys: Sequence[str], *, with_frames: bool) -> tuple[Trajectories, Frames | None]:
+    from zest_rl.sources.lerobot import is_lerobot, open_lerobot
+    from zest_rl.sources.robomimic import open_robomimic
+
+    if path.is_dir() and not is_lerobot(path):
+        raise BadInput(
+            f"{path} is a folder, but no LeRobot dataset (it has no meta/info.json); give a Minari id, a robomimic "
+            "HDF5 file or a LeRobot folder"
+        )
+    return (open_lerobot if path.is_dir() else open_robomimic)(path, keys, with_frames=with_frames)
+
+
+def _minari_frames(dataset: str, keys: Sequence[str], cameras: Sequence[str]) -> Frames:
+    names = data.episode_names(dataset)
+    file = data.dataset_path(dataset) / data.DATA_FILE
+    found = picture_entries(file, f"{names[0]}/observations")
+    if cameras or not (keys or any(found.values())):
+        from zest_rl.sources.states import find_states
+
+        env_spec = data.read_metadata(dataset).get("env_spec")
+        return find_states(file, names, env_spec, cameras, f"dataset {dataset}")
+    chosen = choose_pictures(found, keys, f"dataset {dataset}", "observations")
+    views = tuple("/".join(part for part in ("observations", key) if part) for key in chosen)
+    return Pictures(file, tuple(names), views)

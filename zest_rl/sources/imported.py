@@ -1,0 +1,100 @@
+"""Episodes of other formats → the files of a Minari dataset, one episode in memory at a time."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl import artifacts
+from zest_rl.data import METADATA_FILE
+from zest_rl.errors import BadInput
+from zest_rl.types import FloatArray
+
+
+@dataclass(frozen=True)
+class Imported:
+    """One episode of T steps."""
+
+    obs: dict[str, FloatArray]
+    """(T+1, n) float32 each, no pictures; where the last was not recorded, it repeats the one before."""
+    actions: FloatArray
+    """(T, act_dim) float32."""
+    rewards: FloatArray
+    """(T,) float32, NaN where none were recorded."""
+    terminated: bool
+
+    def __post_init__(self) -> None:
+        n_steps = len(self.actions)
+        wrong = [name for name, values in self.obs.items() if values.shape[:1] != (n_steps + 1,)]
+        if n_steps == 0 or wrong or self.actions.ndim != 2 or self.rewards.shape != (n_steps,):
+            raise BadInput(
+                f"an episode must have T >= 1 actions (T, n), T rewards and observations of T + 1 steps, got actions "
+                f"{self.actions.shape}, rewards {self.rewards.shape}"
+                + (f", and {wrong[0]} of {self.obs[wrong[0]].shape}" if wrong else "")
+            )
+        if not self.obs:
+            raise BadInput("an episode must hold numbers among its observations, for a policy to act on; got none")
+
+
+def dataset_id_of(path: Path) -> str:
+    """Return ``zest/NAME-v0`` for a file or folder."""
+    name = re.sub(r"[^A-Za-z0-9_.]+", "-", path.stem if path.is_file() else path.name).strip("-._")
+    return f"zest/{name or 'dataset'}-v0"
+
+
+def fingerprint(episodes: Iterable[Imported]) -> str:
+    """Hash all that training may see of the episodes, but no rewards."""
+    return artifacts.hash_json(
+        [
+            [
+                sorted(episode.obs),
+                artifacts.hash_arrays(*(episode.obs[name] for name in sorted(episode.obs)), episode.actions),
+                episode.terminated,
+            ]
+            for episode in episodes
+        ]
+    )
+
+
+def fill(folder: Path, dataset_id: str, episodes: Iterable[Imported], description: str) -> None:
+    """Write the files of a Minari dataset; see `zest_rl.data_writer.Trajectories`."""
+    import minari
+    from gymnasium import spaces
+    from minari.data_collector import EpisodeBuffer
+    from minari.dataset.minari_storage import MinariStorage
+
+    def space(array: NDArray[Any]) -> spaces.Box:
+        return spaces.Box(-np.inf, np.inf, array.shape[1:], np.float32)
+
+    storage = None
+    for i, episode in enumerate(episodes):
+        if storage is None:
+            observation_space = spaces.Dict({name: space(values) for name, values in episode.obs.items()})
+            storage = MinariStorage.new(
+                folder / "data", observation_space=observation_space, action_space=space(episode.actions)
+            )
+        last = np.arange(len(episode.actions)) == len(episode.actions) - 1
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            storage.update_episodes(
+                [
+                    EpisodeBuffer(
+                        id=i,
+                        observations=episode.obs,
+                        actions=episode.actions,
+                        rewards=episode.rewards,
+                        terminations=last & episode.terminated,
+                        truncations=last & (not episode.terminated),
+                    )
+                ]
+            )
+    metadata = artifacts.read_json(folder / METADATA_FILE)
+    metadata |= {"dataset_id": dataset_id, "minari_version": minari.__version__, "description": description}
+    artifacts.write_json(folder / METADATA_FILE, metadata)

@@ -1,0 +1,55 @@
+"""Pictures that HDF5 files hold beside the episodes: Minari's image observations, robomimic's ``*_image``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+from zest_rl import artifacts
+from zest_rl.observations import ROWS, entries, n_channels, read_pictures, stored_rows
+from zest_rl.types import Frame
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """`Frames` that are stored in one HDF5 file, one group per episode."""
+
+    file: Path
+    episodes: tuple[str, ...]
+    """Groups of the episodes."""
+    views: tuple[str, ...]
+    """Paths of the entries within a group, one per view."""
+    lasts: tuple[str, ...] = ()
+    """Paths of entries whose last row is x_T, one per view, where `views` end with x_{T-1}."""
+
+    def describe(self) -> dict[str, Any]:
+        """Tell which entries are the frames."""
+        return {"kind": "pictures", "views": list(self.views), "last_frame_from": list(self.lasts)}
+
+    def digest(self, episode: int) -> str:
+        """Hash the rows as they are stored."""
+        with h5py.File(self.file, "r") as file:
+            group = file[self.episodes[episode]]
+            parts = (part for view in self.views for part in stored_rows(group[view]))
+            lasts = (group[last][-1:] for last in self.lasts)
+            return artifacts.hash_json([artifacts.hash_stream(rows) for rows in (parts, lasts)])
+
+    def read(self, episode: int) -> Iterator[Sequence[Frame]]:
+        """Yield the views of each step."""
+        with h5py.File(self.file, "r") as file:
+            group = file[self.episodes[episode]]
+            for start in range(0, len(group[self.views[0]]), ROWS):
+                rows = slice(start, start + ROWS)
+                yield from zip(*(read_pictures(group[view], rows) for view in self.views), strict=True)
+            if self.lasts:
+                yield [read_pictures(group[last], slice(-1, None))[0] for last in self.lasts]
+
+
+def picture_entries(file: Path, group: str) -> dict[str, int | None]:
+    """Return the entries below a group with their numbers of channels; None where an entry is no picture."""
+    with h5py.File(file, "r") as opened:
+        return {name: n_channels(entry) for name, entry in entries(opened[group]).items()}

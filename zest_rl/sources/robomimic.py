@@ -1,0 +1,111 @@
+"""robomimic's HDF5 files: ``data/demo_I`` with ``obs/``, ``actions``, ``rewards``, ``dones`` and mostly ``next_obs/``.
+
+Layout: https://robomimic.github.io/docs/datasets/overview.html. obs/KEY has T rows, o_0 … o_{T-1}; o_T is the
+last row of next_obs/KEY, and where there is no next_obs it repeats o_{T-1}. An episode counts as terminated when its
+last ``dones`` is 1, and else as cut by the horizon.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from zest_rl.errors import BadInput
+from zest_rl.observations import choose_pictures, entries, n_channels
+from zest_rl.sources import imported
+from zest_rl.sources.imported import Imported
+from zest_rl.sources.pictures import Pictures, picture_entries
+from zest_rl.types import FloatArray
+
+
+@dataclass(frozen=True)
+class Demos:
+    """The `Trajectories` of a robomimic file; pictures are left where they are."""
+
+    file: Path
+    names: tuple[str, ...]
+    """Groups of the episodes: data/demo_0, …"""
+    n_steps: tuple[int, ...]
+    """T of every episode."""
+    n_bytes: int
+    """Of all numbers, about."""
+
+    @property
+    def dataset_id(self) -> str:
+        """Made of the file's name."""
+        return imported.dataset_id_of(self.file)
+
+    def fingerprint(self) -> str:
+        """Hash observations, actions and ends."""
+        return imported.fingerprint(self.episodes())
+
+    def fill(self, folder: Path) -> None:
+        """Write them as a Minari dataset."""
+        imported.fill(folder, self.dataset_id, self.episodes(), f"Imported from {self.file.name} (robomimic).")
+
+    def episodes(self) -> Iterator[Imported]:
+        """Read one episode at a time."""
+        with h5py.File(self.file, "r") as file:
+            for name in self.names:
+                yield _read(file[name])
+
+
+def _read(demo: h5py.Group) -> Imported:
+    actions = np.asarray(demo["actions"][()], np.float32)
+    rewards = np.asarray(demo["rewards"][()], np.float32) if "rewards" in demo else np.full(len(actions), np.nan, "f4")
+    obs = {}
+    for path, entry in entries(demo["obs"]).items():
+        if n_channels(entry) is None and entry.dtype.kind in "biuf" and entry.ndim > 0:
+            rows: FloatArray = np.asarray(entry[()], np.float32).reshape(len(entry), -1)
+            after = demo.get(f"next_obs/{path}")
+            last = rows[-1:] if after is None else np.asarray(after[-1:], np.float32).reshape(1, -1)
+            obs[path.replace("/", ".")] = np.concatenate([rows, last])
+    ends = np.asarray(demo["dones"][()]) if "dones" in demo else np.zeros(1)
+    try:
+        return Imported(obs, actions, rewards, bool(len(ends) and ends[-1]))
+    except BadInput as error:
+        raise BadInput(f"{demo.name}: {error}") from error
+
+
+def open_robomimic(path: Path, keys: Sequence[str], *, with_frames: bool = True) -> tuple[Demos, Pictures | None]:
+    """Open a robomimic file.
+
+    Args:
+        path: the file.
+        keys: which entries of obs/ are the frames, one per view; empty: the only pictures there are.
+        with_frames: False where the frames are elsewhere.
+
+    Returns:
+        The episodes; and their pictures, None where there are none, or they are not asked for.
+
+    Raises:
+        BadInput: another kind of file, no demos, or its pictures cannot be told apart.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            demos = file.get("data")
+            found = [name for name in demos if name.startswith("demo_")] if isinstance(demos, h5py.Group) else []
+            names = [f"data/{name}" for name in sorted(found, key=lambda name: int(name.removeprefix("demo_")))]
+            lacking = [name for name in names if "actions" not in file[name] or "obs" not in file[name]]
+            if not names or lacking:
+                raise BadInput(
+                    f"{path} must hold data/demo_0, … with actions and obs/, as robomimic's files do; "
+                    + (f"{lacking[0]} lacks one of them (extract observations first)" if lacking else "it has none")
+                )
+            n_steps = tuple(len(file[name]["actions"]) for name in names)
+            has_last = all("next_obs" in file[name] for name in names)
+            numbers = [e for e in entries(file[names[0]]["obs"]).values() if n_channels(e) is None]
+            n_bytes = 4 * sum(n_steps) * (32 + sum(int(np.prod(e.shape[1:])) for e in numbers))
+    except OSError as error:
+        raise BadInput(f"{path} cannot be read as HDF5 ({error}); relabel takes robomimic's files") from error
+    pictures = picture_entries(path, f"{names[0]}/obs")
+    demos_ = Demos(path.resolve(), tuple(names), n_steps, n_bytes)
+    if not with_frames or not (keys or any(pictures.values())):
+        return demos_, None
+    chosen = choose_pictures(pictures, keys, str(path), "obs")
+    after = tuple(f"next_obs/{key}" for key in chosen) if has_last else ()
+    return demos_, Pictures(path.resolve(), tuple(names), tuple(f"obs/{key}" for key in chosen), after)

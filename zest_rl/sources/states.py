@@ -1,0 +1,291 @@
+"""Recorded simulator states of a Gymnasium environment → frames, rendered from the environment's own model.
+
+A frame is drawn as `zest_rl.rendering` draws the kitchen: no shadows, reflections, multisampling or sky. It shows the
+state exactly where all that moves is in qpos, or is known to `SCENERY`: targets and furniture that an environment puts
+elsewhere in each episode. Environments are made of the allow-listed packages alone (`zest_rl.data.check_env_spec`).
+"""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import importlib.metadata
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import redirect_stderr
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import zest_rl.load_order  # noqa: F401  # isort: skip
+import gymnasium
+import h5py
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl import artifacts
+from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.observations import entries
+from zest_rl.rendering import Canvas
+from zest_rl.types import Frame
+
+SIZE = 224
+"""Side of the square frames, in pixels."""
+Doubles = NDArray[np.float64]
+Columns = tuple[tuple[str, int], ...]
+"""Paths within an episode and how many of their first columns make up qpos, in order; -1: all."""
+
+_VERSION = 1  # raise it with any change of this file that changes a pixel: cached embeddings depend on it
+_MAZES = "gymnasium_robotics.envs.maze."
+_ADROIT = "gymnasium_robotics.envs.adroit_hand."
+_FETCH = "gymnasium_robotics.envs.fetch."
+
+IN_OBSERVATIONS: Mapping[str, Columns] = {
+    f"{_MAZES}point_maze": (("observations/observation", 2),),
+    f"{_MAZES}ant_maze": (("observations/achieved_goal", 2), ("observations/observation", 13)),
+    "gymnasium.envs.mujoco.half_cheetah_v5": (("infos/x_position", 1), ("observations", 8)),
+    "gymnasium.envs.mujoco.hopper_v5": (("infos/x_position", 1), ("observations", 5)),
+    "gymnasium.envs.mujoco.walker2d_v5": (("infos/x_position", 1), ("observations", 8)),
+}
+"""Where qpos stands, to the bit, in what environments observe: entry point → columns. Fetch's and Adroit's
+observations do not hold it, so their datasets need the recorded state."""
+
+
+@dataclass(frozen=True)
+class States:
+    """`Frames` rendered from what is recorded of the simulator in a Minari dataset."""
+
+    file: Path
+    episodes: tuple[str, ...]
+    """Groups of the episodes."""
+    env_spec: str
+    """Of the environment, as JSON, checked."""
+    qpos: Columns
+    scenery: tuple[str, ...]
+    """Paths of what else is put into the scene."""
+    cameras: tuple[str, ...] = ()
+    """Of the model; empty: where the environment's own camera stands."""
+
+    @property
+    def views(self) -> Sequence[str]:
+        """Names of the cameras."""
+        return self.cameras or (_DEFAULT_CAMERA,)
+
+    def describe(self) -> dict[str, Any]:
+        """Tell what was rendered how."""
+        return {
+            "kind": "states",
+            "views": list(self.views),
+            "qpos_from": [list(column) for column in self.qpos],
+            "scenery_from": list(self.scenery),
+            "size": SIZE,
+            "env_id": json.loads(self.env_spec).get("id"),
+        }
+
+    def digest(self, episode: int) -> str:
+        """Hash the states, the environment with its versions, and the cameras."""
+        versions = [importlib.metadata.version(name) for name in ("mujoco", "gymnasium", "gymnasium-robotics")]
+        recorded = self._recorded(episode)
+        how = [self.env_spec, versions, self.cameras, SIZE, _VERSION, sorted(recorded)]
+        return artifacts.hash_json([artifacts.hash_arrays(*(recorded[name] for name in sorted(recorded))), how])
+
+    def read(self, episode: int) -> Iterator[Sequence[Frame]]:
+        """Render each state."""
+        recorded, stage = self._recorded(episode), stage_of(self.env_spec, self.cameras)
+        for step in range(len(recorded["qpos"])):
+            yield stage.render({name: values[step] for name, values in recorded.items()})
+
+    def _recorded(self, episode: int) -> dict[str, Doubles]:
+        """Read qpos (T+1, nq), and by its last name all that is put into the scene (T+1, n)."""
+        with h5py.File(self.file, "r") as file:
+            group = file[self.episodes[episode]]
+            n_rows = len(group["actions"]) + 1
+            columns = []
+            for path, n in self.qpos:
+                values = _rows(group, path, n_rows)
+                columns.append(values if n < 0 else values[:, :n])
+            found = {path.rpartition("/")[2]: _rows(group, path, n_rows) for path in self.scenery}
+            return {**found, "qpos": np.concatenate(columns, axis=1)}
+
+
+_DEFAULT_CAMERA = "the environment's own camera"
+
+
+def _rows(group: h5py.Group, path: str, n_rows: int) -> Doubles:
+    if path not in group:
+        raise BadInput(f"{group.name} has no {path!r}, which its frames are rendered from; record it, or give --frames")
+    values = np.asarray(group[path][()], dtype=np.float64)
+    if len(values) != n_rows:
+        raise BadInput(f"{group.name}/{path} must have T + 1 = {n_rows} rows, one per observation, got {len(values)}")
+    if not np.isfinite(values).all():
+        raise BadInput(f"{group.name}/{path} must be finite, got NaN or infinity; drop the episode")
+    return values.reshape(n_rows, -1)
+
+
+def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, cameras: Sequence[str], what: str) -> States:
+    """Find what a Minari dataset records of the simulator's state.
+
+    Args:
+        file: its HDF5 file.
+        episodes: the groups in it.
+        env_spec: of its environment, as JSON, checked by `zest_rl.data.check_env_spec`.
+        cameras: of the model; empty: the environment's own.
+        what: names the dataset in an error.
+
+    Raises:
+        BadInput: no state, several, or one that does not fit the model; no such camera.
+        ZestError: the environment cannot be made here.
+    """
+    if env_spec is None:
+        raise BadInput(
+            f"{what} shows no frames: there are no pictures to choose, and it names no environment whose recorded "
+            "states could be rendered; give --frames FOLDER with a video of each episode"
+        )
+    spec = json.loads(env_spec)
+    entry_point, kwargs = str(spec["entry_point"]), spec.get("kwargs") or {}
+    with h5py.File(file, "r") as opened:
+        group = opened[episodes[0]]
+        infos = entries(group["infos"], "infos") if "infos" in group else {}
+        recorded = [path for path in infos if path.rpartition("/")[2] == "qpos"]
+        there = {*infos, *entries(group["observations"], "observations")}
+    if len(recorded) > 1:
+        raise BadInput(f"{what} records several states ({', '.join(recorded)}); remove all but one")
+    columns: Columns | None = ((recorded[0], -1),) if recorded else None
+    if columns is None and kwargs.get("exclude_current_positions_from_observation", True):
+        columns = next((found for start, found in IN_OBSERVATIONS.items() if entry_point.startswith(start)), None)
+    if columns is None:
+        raise BadInput(
+            f"{what} shows no frames: there are no pictures among its observations, its infos record no qpos, and the "
+            f"observations of {spec.get('id')} do not hold it to the bit. Record infos/state/qpos, or give --frames "
+            "FOLDER with a video of each episode"
+        )
+    stage = stage_of(env_spec, tuple(cameras))
+    folder = columns[0][0].rpartition("/")[0]
+    scenery = tuple(path.format(folder=folder) for path in stage.scenery)
+    missing = [path for path in (*scenery, *(path for path, _ in columns)) if path not in there]
+    if missing:
+        raise BadInput(
+            f"{what} lacks {', '.join(missing)}: {spec.get('id')} puts things elsewhere in each episode, and frames "
+            "without that would be wrong. Record it, or give --frames FOLDER"
+        )
+    states = States(file, tuple(episodes), env_spec, columns, scenery, tuple(cameras))
+    n_found = states._recorded(0)["qpos"].shape[1]
+    if n_found != stage.model.nq:
+        raise BadInput(f"{what}: qpos must have {stage.model.nq} columns for {spec.get('id')}, got {n_found}")
+    return states
+
+
+# --- the environment as a stage ---------------------------------------------------------------------------------------
+
+
+class Stage:
+    """One environment, and cameras that look at its model."""
+
+    def __init__(self, env: Any, entry_point: str, cameras: tuple[str, ...]) -> None:
+        """Open a GL context; see `stage_of`."""
+        self.env, self.model, self.data = env, env.model, env.data
+        visual = self.model.vis
+        visual.global_.offwidth = visual.global_.offheight = SIZE
+        visual.quality.shadowsize = visual.quality.offsamples = 0
+        self._put, self.scenery = next(
+            ((put, needs(env)) for start, (put, needs) in SCENERY.items() if entry_point.startswith(start)), (_pose, ())
+        )
+        self._canvas = Canvas(self.model, tuple(_camera(env, name) for name in cameras or (None,)), SIZE)
+        self._canvas.hide_sky()
+
+    def render(self, recorded: Mapping[str, Doubles]) -> list[Frame]:
+        """Draw one state: one (H, W, 3) frame per camera."""
+        self._put(self.env, recorded)
+        mujoco.mj_fwdPosition(self.model, self.data)
+        return list(self._canvas.draw(self.data))
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self._canvas.close()
+
+
+@functools.cache
+def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
+    """Return this process's stage, open until the process ends.
+
+    Raises:
+        BadInput: the environment has no MuJoCo model, or no such camera.
+        ZestError: the environment cannot be made with the packages here, or no GL backend works.
+    """
+    spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
+    try:
+        with redirect_stderr(StringIO()):  # on import gymnasium_robotics prints news of its other environments
+            env: Any = gymnasium.make(spec, disable_env_checker=True).unwrapped
+    except Exception as error:  # whatever an environment raises
+        raise ZestError(
+            f"{spec.id} cannot be made here ({type(error).__name__}: {error}); install what it needs, or give --frames "
+            "FOLDER with a video of each episode"
+        ) from error
+    if not isinstance(getattr(env, "model", None), mujoco.MjModel):
+        raise BadInput(f"{spec.id} has no MuJoCo model to render; give --frames FOLDER with a video of each episode")
+    stage = Stage(env, str(spec.entry_point), cameras)
+    atexit.register(stage.close)
+    return stage
+
+
+def _camera(env: Any, name: str | None) -> mujoco.MjvCamera:
+    """Return a camera of the model; without a name the one that ``env.render()`` uses: "track", or a free one."""
+    model, camera = env.model, mujoco.MjvCamera()
+    names = [model.camera(i).name for i in range(model.ncam)]
+    if name is None and "track" in names:
+        name = "track"
+    if name is not None:
+        if name not in names:
+            raise BadInput(f"the model has no camera {name!r}; {nearest(name, names)}")
+        camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, names.index(name)
+        return camera
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    inner = (getattr(env, part, None) for part in ("point_env", "ant_env", "robot_env"))
+    renderers = (getattr(one, "mujoco_renderer", None) for one in (env, *inner))
+    settings = next((one.default_cam_config for one in renderers if one is not None), None) or {}
+    for field in ("lookat", "distance", "azimuth", "elevation"):
+        if field in settings:
+            setattr(camera, field, settings[field])
+    return camera
+
+
+def _pose(env: Any, recorded: Mapping[str, Doubles]) -> None:
+    env.data.qpos[:] = recorded["qpos"]
+
+
+def _pose_hand(env: Any, recorded: Mapping[str, Doubles]) -> None:
+    state = {name: recorded[name] for name in env._state_space.spaces if name != "qvel"}
+    env.set_env_state({**state, "qvel": np.zeros(env.model.nv)})
+
+
+def _pose_maze(env: Any, recorded: Mapping[str, Doubles]) -> None:
+    _pose(env, recorded)
+    env.goal = recorded["desired_goal"]
+    env.update_target_site_pos()
+
+
+def _pose_fetch(env: Any, recorded: Mapping[str, Doubles]) -> None:
+    _pose(env, recorded)
+    mujoco.mj_forward(env.model, env.data)
+    env.goal = recorded["desired_goal"]
+    env._render_callback()  # what it does before each frame of its own: the target goes where the goal is
+
+
+def _goal_paths(env: Any) -> tuple[str, ...]:
+    return ("observations/desired_goal",)
+
+
+def _hand_paths(env: Any) -> tuple[str, ...]:
+    return tuple(f"{{folder}}/{name}" for name in env._state_space.spaces if name not in ("qpos", "qvel"))
+
+
+Put = Callable[[Any, Mapping[str, Doubles]], None]
+SCENERY: Mapping[str, tuple[Put, Callable[[Any], tuple[str, ...]]]] = {
+    _ADROIT: (_pose_hand, _hand_paths),
+    _FETCH: (_pose_fetch, _goal_paths),
+    _MAZES: (_pose_maze, _goal_paths),
+}
+"""Entry point → how a recorded state is put into the environment, and the paths of what that takes besides qpos;
+``{folder}`` is the group that qpos is recorded in."""
