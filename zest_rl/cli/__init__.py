@@ -35,6 +35,7 @@ VERBS = {
     "select": "datasets and a goal → does the goal find its frames (`goals`), `actions`, real `footage`?",
     "export": "a dataset → a file that other offline-RL code reads",
     "train": "a dataset → a policy, by `bc` or `dt`",
+    "adopt": "a policy that another program trained → a run folder, as `train` leaves one",
     "evaluate": "a policy → returns and success in MuJoCo, with videos",
     "reproduce": "a recipe → a whole table or figure, cell by cell; rerun it to resume",
     "report": "results → one HTML file",
