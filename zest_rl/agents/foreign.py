@@ -20,6 +20,7 @@ from __future__ import annotations
 import importlib.metadata
 import shlex
 import shutil
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -247,7 +248,9 @@ def load(run_dir: Path, meta: dict[str, Any], device: torch.device) -> ForeignPo
 
 def _read_torchscript(path: Path, device: torch.device) -> Act:
     try:
-        module = torch.jit.load(str(path), map_location=device).eval()  # type: ignore[no-untyped-call]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # torch would rather have another format, but this is used
+            module = torch.jit.load(str(path), map_location=device).eval()  # type: ignore[no-untyped-call]
     except (RuntimeError, ValueError) as error:
         raise BadInput(
             f"{path.name} cannot be read as TorchScript; write it with torch.jit.save or d3rlpy's save_policy "
