@@ -125,9 +125,9 @@ class Child:
             timer.cancel()
         if late.is_set():
             raise ZestError(
-                f"the policy's process gave no answer within {self._timeout:g} s and was killed{self._last_words()}; "
-                f"it must answer each line of stdin by one line on stdout, and flush it. If it only needs longer, set "
-                f"{TIMEOUT_VARIABLE} (seconds)"
+                f"the policy's process gave no answer within {self._timeout:g} s and was killed; it must answer "
+                "each line of stdin by one line on stdout, and flush it. If it only needs longer, set "
+                f"{TIMEOUT_VARIABLE} (seconds){self._last_words()}"
             )
         if not line:
             with suppress(subprocess.TimeoutExpired):
@@ -149,7 +149,7 @@ class Child:
         size = self._errors.seek(0, os.SEEK_END)
         self._errors.seek(max(0, size - 1000))
         text = self._errors.read().decode(errors="replace").strip()
-        return f"; its stderr ends with:\n{text}\n" if text else ""
+        return f"; its stderr ends with:\n{text}" if text else ""
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:

@@ -20,7 +20,7 @@ def main() -> None:
 
     model = d3rlpy.load_learnable(sys.argv[1], device="cpu:0")
     if not isinstance(model, d3rlpy.algos.QLearningAlgoBase):
-        sys.exit(f"{type(model).__name__} is conditioned on returns; only policies from observations to actions are")
+        sys.exit(f"{type(model).__name__} acts on returns, which are not handed out; serve it by a program of your own")
     for line in sys.stdin:
         message = json.loads(line)
         if "begin" in message:
