@@ -20,10 +20,11 @@ ORDER = (
     "metrics", "quality", "envs", "arm", "experts", "collect",
     "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "looks", "selection",
     "footage", "relabel", "sources", "frame_scorer", "relabel_frames", "export", "agents",
-    "checkpoints", "training", "evaluation", "report", "panels", "comparison", "inspection",
+    "checkpoints", "training", "adoption", "evaluation", "report", "panels", "comparison", "inspection",
     "inspection_page", "candidates", "multistep",
     "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.inspect", "cli.select_footage",
-    "cli.select", "cli.follow", "cli.export", "cli.train", "cli.evaluate", "cli.report", "cli.plans", "cli.studies",
+    "cli.select", "cli.follow", "cli.export", "cli.train", "cli.adopt", "cli.evaluate", "cli.report", "cli.plans",
+    "cli.studies",
     "cli.reproduce",
 )  # fmt: skip
 """The pipeline: a module imports only what stands before it. A folder is listed once, its files share the place."""

@@ -64,6 +64,9 @@ class Replay:
         self.told.append(rewards.copy())
         self.policy.observe(rewards)
 
+    def end(self) -> dict[str, np.ndarray]:
+        return self.policy.end()
+
 
 @pytest.fixture
 def replay(trained: Path) -> Callable[..., tuple[Replay, Arrays]]:
@@ -285,7 +288,7 @@ def test_a_run_that_is_not_finished_or_no_run_is_refused(trained: Path) -> None:
     (trained / "bc-0" / "meta.json").unlink()
     with pytest.raises(BadInput, match=r"bc-0 is not finished; type its `zest train` command again"):
         evaluate(trained / "bc-0", ONLINE)
-    with pytest.raises(BadInput, match="is not the folder of a training; give a folder that `zest train` left"):
+    with pytest.raises(BadInput, match="give a folder that `zest train` or `zest adopt` left"):
         evaluate(trained / "bc-9", ONLINE)
 
 

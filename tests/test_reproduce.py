@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from zest_rl import artifacts, cli, collect, comparison, data
 from zest_rl.cli import reproduce
@@ -244,6 +245,35 @@ def test_the_flags_of_a_method_win_over_those_of_its_agent_and_these_over_the_sh
     ], "all of the first seed come first"  # fmt: skip
 
 
+def test_a_policy_that_was_trained_elsewhere_is_a_method_like_the_others(
+    whole: Reproduced,
+    refusal: Callable[..., tuple[int, str]],
+    tmp_path: Path,
+) -> None:
+    policy = tmp_path / "{task}-{seed}.pt"
+    text = f'\n[methods.Theirs]\npolicy = "torchscript:{policy}"\ngoal = "scene"\nkind = "control"\n'
+    recipe = write(tmp_path, RECIPE + text)
+    output = shutil.copytree(whole.output, tmp_path / "other")
+    code, message = refusal("reproduce", recipe, "--output", output, "--n-workers", "1")
+    assert code == 2
+    goal = next(name for name in data.list_datasets() if "-zest-" in name)
+    assert "policies from elsewhere are missing; train them, then go on:\n" in message
+    assert f"'Theirs', trained on {goal} with seed 0: there is no file {tmp_path / 'micro-0.pt'}" in message
+    torch.jit.trace(torch.nn.Linear(59, 9), torch.zeros(1, 59)).save(str(tmp_path / "micro-0.pt"))
+    config = reproduce.Config(recipe, output, n_workers=1)
+    first = reproduce.run(config, reproduce.SilentUi())
+    assert first["n_cells_run"] == 1
+    assert {name: row for name, row in first["rows"].items() if name != "Theirs"} == whole.result["rows"]
+    row = first["rows"]["Theirs"]
+    (run,) = (output / "cells").glob("micro-foreign-scene-seed0-*")
+    assert artifacts.read_json(run / "meta.json")["name"] == "Theirs"
+    assert (row["kind"], row["n_seeds"], row["n_episodes"]) == ("control", 1, 2)
+    assert reproduce.run(config, reproduce.SilentUi())["n_cells_run"] == 0
+    torch.jit.trace(torch.nn.Linear(59, 9), torch.zeros(1, 59)).save(str(tmp_path / "micro-0.pt"))
+    assert reproduce.run(config, reproduce.SilentUi())["n_cells_run"] == 1, "another file is another policy"
+    assert len(list((output / "cells").glob("micro-foreign-scene-seed0-*"))) == 2
+
+
 def test_one_task_may_have_several_datasets(tmp_path: Path) -> None:
     tables = "".join(
         f"[tasks.at-{level}]\ntask = 'micro'\nlevel = {level}\ndataset = 'zest/at-{level}-v0'\n" for level in (60, 95)
@@ -281,7 +311,7 @@ def test_one_task_may_have_several_datasets(tmp_path: Path) -> None:
         ("noise_max = 1.0", "noise-maxx = 1.0", "[collect]: unknown key 'noise-maxx'; did you mean 'noise-max'"),
         ("n_updates = 20", 'n_updates = "many"', "'n_updates' must be an integer, got 'many'"),
         ("hidden_size = 32", "hidden_size = 0", "hidden_size must be at least 1, got 0"),
-        ('agent = "bc"', "", "[methods.'BC']: 'agent' is required"),
+        ('agent = "bc"', "", "[methods.'BC']: a method has either an agent or a policy, got None and None"),
         ('agent = "bc"', 'agent = "bcc"', "unknown agent 'bcc'; did you mean 'bc'"),
         ('kind = "control"', 'kind = "baseline"', "'kind' must be one of 'method', 'control', got 'baseline'"),
         ("context_len = 5", "contextlen = 5", "unknown key 'contextlen'; did you mean 'context-len'"),
@@ -289,6 +319,10 @@ def test_one_task_may_have_several_datasets(tmp_path: Path) -> None:
         ('"dt"\ngoal = "scene"', '"dt"\ngoal = "sceen"', "unknown goal 'sceen'; did you mean 'scene'"),
         ("n_episodes = 2", "n_episodes = 0", "n_episodes must be at least 1, got 0"),
         ("n_episodes = 2", 'rtg = "offline"', "'rtg' must be one of 'online', 'constant', 'schedule', got 'offline'"),
+        ('agent = "bc"', 'agent = "bc"\npolicy = "onnx:x"', "either an agent or a policy, got 'bc' and 'onnx:x'"),
+        ('agent = "bc"', 'policy = "onnx:x"\nhidden_size = 1', "[methods.'BC']: unknown key 'hidden_size'"),
+        ('agent = "bc"', 'policy = "onnx:x"\nseed = 1', "'seed' is not for a recipe to set"),
+        ("seeds = [0]", 'seeds = [0, 1]\nmethods.A.policy = "onnx:x"', "the policy must hold {seed}, got 'onnx:x'"),
     ],
 )
 def test_a_bad_recipe_is_refused_before_anything_runs(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl import artifacts, data, metrics
+from zest_rl.agents.foreign import FOREIGN
 from zest_rl.checkpoints import snapshots
 from zest_rl.errors import BadInput
 from zest_rl.evaluation import Evaluation, EvaluationConfig, check_finished, evaluation_folder, read_evaluation
@@ -52,7 +53,8 @@ class Method:
 def methods_of_runs(runs: Sequence[Path]) -> tuple[Method, ...]:
     """Make one method of the runs that differ in their training seed alone.
 
-    A method is called after its agent and goal; where that does not tell two apart, also by the settings that do.
+    A method is called after its agent and goal, or as `zest adopt` was told; where that does not tell two apart, also
+    by the settings that do.
 
     Raises:
         BadInput: a folder is no finished run, or two runs are the same training with the same seed.
@@ -67,7 +69,10 @@ def methods_of_runs(runs: Sequence[Path]) -> tuple[Method, ...]:
         settings[key] = own
         earlier = groups.setdefault(key, {}).setdefault(meta["seed"], run)
         if earlier != run:
-            raise BadInput(f"{earlier} and {run} are the same training with the same seed; give one of them")
+            raise BadInput(
+                f"{earlier} and {run} are the same training with the same seed; give one of them"
+                + (", or tell them apart by --name or --seed of `zest adopt`" if meta["agent"] == FOREIGN else "")
+            )
     methods = []
     for group, seeds in groups.items():
         own = settings[group]
@@ -96,6 +101,8 @@ def goal_name(meta: dict[str, Any]) -> str | None:
 
 
 def _short_name(meta: dict[str, Any]) -> str:
+    if meta["agent"] == FOREIGN:
+        return str(meta["name"])
     agent = str(meta["agent"]).upper()
     return agent if agent == "BC" else f"{agent} on {goal_name(meta) or 'ground truth'}"
 

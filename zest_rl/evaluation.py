@@ -80,14 +80,15 @@ class Evaluation:
     """Ground-truth returns that are 0 % and 100 %."""
     episodes: tuple[EpisodeResult, ...]
     traces: Arrays
-    """gt_reward (N, T+1), qpos (N, T+1, nq) and, when scored online, score (N, T+1)."""
+    """gt_reward (N, T+1), qpos (N, T+1, nq), score (N, T+1) when scored online, and of a policy from elsewhere clipped
+    (N,), the number of actions that left [-1, 1]."""
 
     def normalized(self) -> NDArray[np.float64]:
         """Normalized return of each episode, in percent: (N,)."""
         return normalized_return(np.array([e.gt_return for e in self.episodes]), self.minimum, self.expert)
 
     def summary(self) -> dict[str, Any]:
-        """JSON-ready: mean with its interval, IQM, success rate."""
+        """JSON-ready: mean with its interval, IQM, success rate; from elsewhere, the share of clipped actions."""
         values = self.normalized()
         success = wilson(sum(e.success for e in self.episodes), len(self.episodes))
         return {
@@ -96,7 +97,11 @@ class Evaluation:
             "success": asdict(success),
             "n_episodes": len(self.episodes),
             "target_return": self.target_return,
+            **({"clipped_actions": self._clipped_share()} if "clipped" in self.traces else {}),
         }
+
+    def _clipped_share(self) -> float:
+        return float(self.traces["clipped"].sum() / sum(episode.n_steps for episode in self.episodes))
 
 
 def target_return(policy: Policy, config: EvaluationConfig) -> float | None:
@@ -131,7 +136,8 @@ def rollout(
         scorer: scores each new state; needed for ``rtg="online"`` with ZeST rewards.
 
     Returns:
-        gt_reward (N, T+1) float32, gt_success (N, T+1) bool, qpos (N, T+1, nq), and score (N, T+1) if scored.
+        gt_reward (N, T+1) float32, gt_success (N, T+1) bool, qpos (N, T+1, nq), score (N, T+1) if scored, and what
+        the policy tells of its episodes at their end.
 
     With ``rtg="online"`` the return-to-go of a policy that was trained on ground-truth rewards falls by those: the
     upper bound of the comparison.
@@ -150,7 +156,6 @@ def rollout(
     resets = [env.reset(seed=seed) for env, seed in zip(envs, seeds, strict=True)]
     obs = np.stack([o for o, _ in resets])
     infos = [info for _, info in resets]
-    policy.begin(len(envs), target_return(policy, config))
     trace: dict[str, list[Any]] = {"gt_reward": [], "gt_success": [], "qpos": []}
     first = np.stack([info["state"]["qpos"] for info in infos])
     scores = [scorer.score_now(first, first)] if scorer is not None else []
@@ -161,22 +166,26 @@ def rollout(
         trace["qpos"].append(np.stack([info["state"]["qpos"] for info in infos]))
 
     record()
-    for step in range(horizon):
-        actions = policy.act(obs)
-        results = [env.step(action) for env, action in zip(envs, actions, strict=True)]
-        obs = np.stack([result[0] for result in results])
-        rewards = np.array([result[1] for result in results], dtype=np.float32)
-        infos = [result[4] for result in results]
-        record()
-        if scorer is not None:
-            scores.append(scorer.score_now(first, trace["qpos"][-1]))
-            level = _reward_kind(policy) != "difference"
-            rewards = scores[-1] if level else scores[-1] - scores[-2]
-        if policy.uses_return:
-            policy.observe(_decrement(policy, config, step, rewards))
-    for env in envs:
-        env.close()
-    arrays = {name: np.stack(values, axis=1) for name, values in trace.items()}
+    try:
+        policy.begin(len(envs), target_return(policy, config))
+        for step in range(horizon):
+            actions = policy.act(obs)
+            results = [env.step(action) for env, action in zip(envs, actions, strict=True)]
+            obs = np.stack([result[0] for result in results])
+            rewards = np.array([result[1] for result in results], dtype=np.float32)
+            infos = [result[4] for result in results]
+            record()
+            if scorer is not None:
+                scores.append(scorer.score_now(first, trace["qpos"][-1]))
+                level = _reward_kind(policy) != "difference"
+                rewards = scores[-1] if level else scores[-1] - scores[-2]
+            if policy.uses_return:
+                policy.observe(_decrement(policy, config, step, rewards))
+    finally:
+        told = policy.end()
+        for env in envs:
+            env.close()
+    arrays = {name: np.stack(values, axis=1) for name, values in trace.items()} | told
     if scorer is not None:
         arrays["score"] = np.stack(scores, axis=1)
     return arrays
@@ -235,7 +244,7 @@ def evaluate(
     """Evaluate the policy that a run ended with; finished parts are kept, so a cut evaluation goes on where it stopped.
 
     Args:
-        run: folder that `zest_rl.training.train` left, with the dataset's entry in its meta.
+        run: folder that `zest_rl.training.train` left, with the dataset's entry in its meta, or `zest_rl.adoption`.
         config: seeds and return-to-go.
         score: also record ZeST scores where the policy does not need them.
         device: where the policy runs.
@@ -311,7 +320,7 @@ def check_finished(run: Path) -> None:
         raise BadInput(
             f"the training in {run} is not finished; type its `zest train` command again to go on"
             if (run / "run.json").exists()
-            else f"{run} is not the folder of a training; give a folder that `zest train` left"
+            else f"{run} is not the folder of a training; give a folder that `zest train` or `zest adopt` left"
         )
 
 

@@ -1,6 +1,7 @@
 """Algorithms: one file each, in the same order (config, model, batch, loss, act); the registry is a dict.
 
-To add one, copy the file that is nearest to it and add a line to `AGENTS`.
+To add one, copy the file that is nearest to it and add a line to `AGENTS`. `foreign` is none of them: it lets policies
+act that other programs trained.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any
 import safetensors.torch
 import torch
 
-from zest_rl.agents import bc, dt
+from zest_rl.agents import bc, dt, foreign
 from zest_rl.agents.base import Agent, DataFacts, Policy
 from zest_rl.artifacts import hash_bytes, read_json
 from zest_rl.errors import BadInput, ZestError, nearest
@@ -41,9 +42,11 @@ def load_policy(run_dir: Path, device: str = "cpu") -> Policy:
 
     Raises:
         ZestError: the run is not finished, or its weights are not the ones that ``meta.json`` names.
-        BadInput: its agent is unknown here.
+        BadInput: its agent is unknown here, or a policy from elsewhere cannot be read.
     """
     meta: dict[str, Any] = read_json(run_dir / "meta.json")
+    if meta["agent"] == foreign.FOREIGN:
+        return foreign.load(run_dir, meta, torch.device(device))
     agent = get_agent(meta["agent"])
     path = run_dir / "model.safetensors"
     try:

@@ -9,6 +9,7 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from zest_rl.errors import BadInput
@@ -165,10 +166,10 @@ def check_fields(what: str, values: Any, rules: Rules) -> None:
 
 
 class Policy(Protocol):
-    """A trained agent at work on N episodes in step: `begin`, then `act` and `observe` in turn."""
+    """A trained agent at work on N episodes in step: `begin`, then `act` and `observe` in turn, then `end`."""
 
     agent: str
-    """Name in the registry."""
+    """Name in the registry, or ``foreign``."""
     meta: dict[str, Any]
     """The run's ``meta.json``."""
     uses_return: bool
@@ -182,6 +183,9 @@ class Policy(Protocol):
 
     def observe(self, rewards: FloatArray) -> None:
         """Take the rewards (N,) of the last actions off the returns still asked for."""
+
+    def end(self) -> dict[str, NDArray[Any]]:
+        """Let go of what the episodes needed, be it after a failure; return what there is to tell, arrays (N, …)."""
 
 
 def check_obs(obs: FloatArray, n_episodes: int, obs_dim: int) -> None:

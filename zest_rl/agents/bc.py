@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from zest_rl.agents.base import (
@@ -153,6 +154,10 @@ class BCPolicy:
 
     def observe(self, rewards: FloatArray) -> None:
         """Rewards change nothing here."""
+
+    def end(self) -> dict[str, NDArray[Any]]:
+        """Nothing is held, and nothing is told."""
+        return {}
 
 
 def make_policy(

@@ -24,6 +24,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from zest_rl.agents.base import (
@@ -288,6 +289,10 @@ class DTPolicy:
     def observe(self, rewards: FloatArray) -> None:
         """Take the rewards (N,) of the last actions off the returns still asked for."""
         self._remaining = self._remaining - rewards
+
+    def end(self) -> dict[str, NDArray[Any]]:
+        """Nothing is held, and nothing is told."""
+        return {}
 
 
 def make_policy(

@@ -36,6 +36,7 @@ VERBS = {
     "follow": "an episode that reaches several goals → its similarity to each of them over time",
     "export": "a dataset → a file that other offline-RL code reads",
     "train": "a dataset → a policy, by `bc` or `dt`",
+    "adopt": "a policy that another program trained → a run folder, as `train` leaves one",
     "evaluate": "a policy → returns and success in MuJoCo, with videos",
     "reproduce": "a recipe → a whole table or figure, cell by cell; rerun it to resume",
     "report": "results → one HTML file",

@@ -20,7 +20,7 @@ class Config:
     """Evaluate a trained policy: normalized ground-truth return and success, with 95 % intervals."""
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """Folder that `zest train` left."""
+    """Folder that `zest train` or `zest adopt` left."""
     n_episodes: int = 50
     """Episodes; equal seeds give equal starts to every policy."""
     seed: int = 1_000_000
@@ -34,7 +34,7 @@ class Config:
     videos: bool = True
     """Write videos of the best, median and worst episode."""
     device: str = "cpu"
-    """Where the policy runs."""
+    """Where the policy runs; those with a process of their own decide for themselves."""
     n_workers: int | None = None
     """Processes; default one per core."""
 
@@ -59,6 +59,11 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         )
     folder = evaluation_folder(config.run, what)
     seconds = time.monotonic() - started
+    summary = result.summary()
+    if summary.get("clipped_actions"):
+        ui.warn(
+            f"{summary['clipped_actions']:.1%} of the actions left [-1, 1] and were clipped, as the environment does"
+        )
     videos = {}
     if config.videos:
         shown = representative(result.normalized())
@@ -66,7 +71,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         ensure_videos(videos.values(), n_workers=config.n_workers)
     return {
         "run": str(config.run),
-        **result.summary(),
+        **summary,
         "result": str(folder / "result.json"),
         "videos": {name: str(video.path) for name, video in videos.items()},
         "seconds": round(seconds, 2),

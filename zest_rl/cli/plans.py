@@ -15,6 +15,8 @@ A recipe has these tables (keys are the flags of the verb)::
     [evaluate]                      `zest evaluate`, for all methods
     [methods."NAME"]                agent = "dt", goal = "NAME" (left out: ground-truth rewards), kind, note, paper,
                                     evaluate = {…} of this method alone, and the agent's own flags
+    [methods."NAME"]                policy = "torchscript:FILE" in place of the agent: `zest adopt`; {task} and {seed}
+                                    stand for those of the cell, and goal says on whose rewards it was trained
 
 Methods that differ in their evaluation alone share their trained policies. A recipe without methods ends with what the
 rewards of its goals are worth: the page of `zest inspect`.
@@ -64,12 +66,25 @@ class Recipe:
 class Entry:
     """What the table of a method says besides the agent's own flags."""
 
-    agent: str
+    agent: str | None = None
+    policy: str | None = None
+    """Trained elsewhere, in the place of an agent."""
     goal: str | None = None
     kind: Literal["method", "control"] = "method"
     note: str = ""
     paper: float | None = None
     evaluate: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if (self.agent is None) == (self.policy is None):
+            raise BadInput(f"a method has either an agent or a policy, got {self.agent!r} and {self.policy!r}")
+
+    @property
+    def maker(self) -> str:
+        """The agent, or ``foreign``."""
+        from zest_rl.agents.foreign import FOREIGN
+
+        return self.agent or FOREIGN
 
 
 @dataclass(frozen=True)
@@ -78,7 +93,7 @@ class PlannedMethod:
 
     entry: Entry
     training: Mapping[str, Any]
-    """Arguments of `zest train AGENT`; dataset and seed are added per cell."""
+    """Arguments of `zest train AGENT` or `zest adopt`; dataset and seed are added per cell."""
     evaluate: Mapping[str, Any]
     """Arguments of `zest evaluate`; the run is added per cell."""
     evaluation: EvaluationConfig
@@ -115,8 +130,9 @@ class Cell:
     method: str
     run: Path
     agent: str
+    """Or ``foreign``."""
     train: Mapping[str, Any]
-    """Arguments of `zest train AGENT`."""
+    """Arguments of `zest train AGENT`, or of `zest adopt`."""
     evaluate: Mapping[str, Any]
     """Arguments of `zest evaluate`."""
     evaluation: EvaluationConfig
@@ -153,7 +169,7 @@ def read_plan(path: Path) -> Plan:
         for name, method in recipe.methods.items()
     }
     unused = {key for key, table in recipe.train.items() if isinstance(table, dict)} - {
-        method.entry.agent for method in methods.values()
+        method.entry.maker for method in methods.values()
     }
     if unused:
         raise BadInput(
@@ -202,24 +218,40 @@ def plan_tasks(collect: Mapping[str, Any], tasks: Mapping[str, Mapping[str, Any]
     return collected
 
 
+def config_of(agent: str) -> type[Any]:
+    """Return the config of the verb that makes the run: `zest train AGENT`, or `zest adopt` for ``foreign``."""
+    from zest_rl.agents.foreign import FOREIGN
+    from zest_rl.cli import adopt, train
+
+    config: type[Any] = adopt.Config if agent == FOREIGN else train.CONFIGS[agent]
+    return config
+
+
 def _plan_method(recipe: Recipe, method: Mapping[str, Any], goals: Mapping[str, Any], where: str) -> PlannedMethod:
     from zest_rl.agents import AGENTS, get_agent
-    from zest_rl.cli import evaluate, train
+    from zest_rl.cli import evaluate
     from zest_rl.cli.recipes import load_config
 
     own = {key: value for key, value in method.items() if key in (f.name for f in fields(Entry))}
     flags = {key: value for key, value in method.items() if key not in own}
     entry = load_config(Entry, own, where)
-    with located(where):
-        get_agent(entry.agent)
+    if entry.agent is not None:
+        with located(where):
+            get_agent(entry.agent)
     if entry.goal is not None and entry.goal not in goals:
         raise BadInput(f"{where}: unknown goal {entry.goal!r}; {nearest(entry.goal, goals)}")
     of_agents = {key: table for key, table in recipe.train.items() if key in AGENTS and isinstance(table, dict)}
     shared = {key: value for key, value in recipe.train.items() if key not in of_agents}
-    training = {"n_updates": 5000, "threads": 1, "device": "cpu"}
-    for table in (shared, of_agents.get(entry.agent, {}), flags):
-        training |= table_of(table, where, "dataset", "seed", "run_dir")
-    load_config(train.CONFIGS[entry.agent], {**training, "dataset": ""}, where)
+    training: dict[str, Any]
+    if entry.policy is not None:
+        if len(recipe.seeds) > 1 and "{seed}" not in entry.policy:
+            raise BadInput(f"{where}: with several seeds the policy must hold {{seed}}, got {entry.policy!r}")
+        training = {"policy": entry.policy, **table_of(flags, where, "dataset", "seed", "run_dir", "name")}
+    else:
+        training = {"n_updates": 5000, "threads": 1, "device": "cpu"}
+        for table in (shared, of_agents.get(entry.maker, {}), flags):
+            training |= table_of(table, where, "dataset", "seed", "run_dir")
+    load_config(config_of(entry.maker), {**training, "dataset": ""}, where)
     arguments = {**table_of(recipe.evaluate, where, "run"), **table_of(entry.evaluate, where, "run")}
     config = load_config(evaluate.Config, {**arguments, "run": ""}, f"{where} [evaluate]")
     with located(f"{where} [evaluate]"):
@@ -249,20 +281,31 @@ def plan_cells(plan: Plan, datasets: Mapping[str, TaskData], output: Path) -> li
     """Return one cell per task, method and seed; the run's folder is named by a hash of its data and all arguments.
 
     All cells of the first seed come first: of what was cut short, a recipe with fewer seeds finds its cells done.
+
+    Raises:
+        BadInput: policies that were trained elsewhere are not there; all of them are named.
     """
     from zest_rl import artifacts, data
-    from zest_rl.cli import train
+    from zest_rl.agents.foreign import identify
     from zest_rl.cli.recipes import load_config
 
     described = {
         name: data.describe(name) for task in datasets.values() for name in (task.source, *task.by_goal.values())
     }
-    cells = []
+    cells, problems = [], []
     for seed, (name, method), (task, of_task) in product(plan.recipe.seeds, plan.methods.items(), datasets.items()):
-        goal, agent = method.entry.goal, method.entry.agent
+        goal, agent = method.entry.goal, method.entry.maker
         dataset = of_task.source if goal is None else of_task.by_goal[goal]
         table = {**method.training, "dataset": dataset, "seed": seed}
-        arguments = asdict(load_config(train.CONFIGS[agent], table, name))  # defaults are arguments, too
+        if method.entry.policy is not None:
+            policy = method.entry.policy.replace("{task}", task).replace("{seed}", str(seed))
+            table |= {"policy": policy, "name": name}
+        arguments = asdict(load_config(config_of(agent), table, name))  # defaults are arguments, too
+        if method.entry.policy is not None:
+            try:
+                arguments |= {"policy": identify(arguments["policy"], arguments["python"]).described()}
+            except BadInput as error:
+                problems.append(f"{name!r}, trained on {dataset} with seed {seed}: {error}")
         digest = artifacts.hash_json([arguments, agent, described[dataset]])
         run = output / "cells" / f"{task}-{agent}-{goal or 'ground-truth'}-seed{seed}-{digest[:8]}"
         cells.append(
@@ -276,4 +319,6 @@ def plan_cells(plan: Plan, datasets: Mapping[str, TaskData], output: Path) -> li
                 method.evaluation,
             )
         )
+    if problems:
+        raise BadInput("\n  ".join(["policies from elsewhere are missing; train them, then go on:", *problems]))
     return cells

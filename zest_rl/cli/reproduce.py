@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from zest_rl.cli import inspect, studies
-from zest_rl.cli.plans import Cell, Plan, TaskData, plan_cells, read_plan
+from zest_rl.cli.plans import Cell, Plan, TaskData, config_of, plan_cells, read_plan
 from zest_rl.cli.recipes import read_recipe
 from zest_rl.cli.ui import SilentUi, Ui
 
@@ -261,11 +261,13 @@ def markdown(result: Mapping[str, Any]) -> str:
 def _work(cell: Cell) -> dict[str, Any]:
     import numpy as np
 
+    from zest_rl.agents.foreign import FOREIGN
     from zest_rl.checkpoints import snapshots
-    from zest_rl.cli import evaluate, train
+    from zest_rl.cli import adopt, evaluate, train
     from zest_rl.cli.recipes import load_config
 
-    train.run(load_config(train.CONFIGS[cell.agent], cell.train, cell.method), SilentUi())
+    make_run = adopt.run if cell.agent == FOREIGN else train.run
+    make_run(load_config(config_of(cell.agent), cell.train, cell.method), SilentUi())
     trained = time.monotonic()
     for run in (cell.run, *snapshots(cell.run)):
         evaluate.run(load_config(evaluate.Config, {**cell.evaluate, "run": str(run)}, cell.method), SilentUi())
@@ -278,7 +280,7 @@ def run_cells(cells: list[Cell], output: Path, ui: Ui, *, n_workers: int | None 
 
     done_folder = output / "done"
     open_cells = {cell.name: cell for cell in cells if not _is_done(cell, done_folder)}
-    total = sum({cell.run: cell.train["n_updates"] for cell in open_cells.values()}.values())
+    total = sum({cell.run: cell.train.get("n_updates", 0) for cell in open_cells.values()}.values())
     with (
         ui.progress("updates of all cells (evaluation follows)", total) as advance,
         _TrainingWatch({cell.run for cell in open_cells.values()}, advance),
@@ -339,6 +341,7 @@ def _seconds(cell: Cell, output: Path) -> dict[str, float]:
     from zest_rl import artifacts
     from zest_rl.parallel import read_arrays
 
-    times = {"train_seconds": artifacts.read_json(cell.run / "meta.json")["train_seconds"]}
+    meta = artifacts.read_json(cell.run / "meta.json")
+    times = {"train_seconds": meta["train_seconds"]} if "train_seconds" in meta else {}
     times |= read_arrays(output / "done" / f"{cell.name}.npz") or {}
     return {name: round(float(value), 1) for name, value in times.items()}

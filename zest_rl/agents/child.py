@@ -1,0 +1,158 @@
+"""A policy in a process of its own, which may be another Python or no Python at all: lines of JSON over its pipes.
+
+Each line that it reads on stdin is answered by one line on stdout; ``docs/foreign_policies.md`` has an example::
+
+    {"begin": {"n_episodes": N, "obs_dim": 59, "act_dim": 9}}    →  {"ready": true}
+    {"obs": [[59 numbers], … N rows]}                            →  {"actions": [[9 numbers], … N rows]}
+    end of stdin                                                 →  it exits
+
+One process plays one batch of N episodes in step, from their first observation to their last: one ``begin``, then one
+``obs`` per step. Numbers are written so that they are read back as the same float32.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import IO, Any
+
+from zest_rl.errors import BadInput, ZestError
+from zest_rl.parallel import THREAD_VARIABLES
+from zest_rl.types import FloatArray
+
+TIMEOUT_VARIABLE, TIMEOUT = "ZEST_POLICY_TIMEOUT", 120.0
+"""Seconds that one answer may take; the first one includes the start of the process and its imports."""
+GRACE = 5.0
+"""Seconds between the end of stdin and the process being killed."""
+MAX_ANSWER = 2**24  # bytes: a line that does not end is no answer
+# The kernel ends the child with us even if we are killed: a hanging child would not notice that its stdin has ended.
+_START = """
+import ctypes, os, signal, sys
+if sys.platform == "linux":
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG, kept by exec
+if os.getppid() == int(sys.argv[1]):
+    os.execvp(sys.argv[2], sys.argv[2:])
+"""
+
+
+class Child:
+    """A command that acts; it is started by `begin` and gone after `end`."""
+
+    def __init__(self, words: Sequence[str], obs_dim: int, act_dim: int):
+        """Take the command's words.
+
+        Raises:
+            BadInput: there is no such program, or the timeout in the environment is no number.
+        """
+        if shutil.which(words[0]) is None:
+            raise BadInput(f"there is no program {words[0]!r} to be run; give its path, or mend PATH")
+        try:
+            self._timeout = float(os.environ.get(TIMEOUT_VARIABLE, TIMEOUT))
+        except ValueError as error:
+            raise BadInput(f"{TIMEOUT_VARIABLE} must be seconds: {error}") from error
+        self._words, self._dims = list(words), {"obs_dim": obs_dim, "act_dim": act_dim}
+        self._process: subprocess.Popen[bytes] | None = None
+        self._errors: IO[bytes] | None = None
+
+    def begin(self, n_episodes: int) -> None:
+        """Start the process and tell it how many episodes it plays.
+
+        Raises:
+            ZestError: it does not answer as it should.
+        """
+        self.end()
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (`end` closes it)
+        self._process = subprocess.Popen(
+            [sys.executable, "-I", "-S", "-c", _START, str(os.getpid()), *self._words],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            env={**os.environ, **dict.fromkeys(THREAD_VARIABLES, "1")},  # results do not depend on who else computes
+            start_new_session=True,  # a group of its own, to be killed as a whole
+        )
+        self._ask({"begin": {"n_episodes": n_episodes, **self._dims}}, "ready")
+
+    def __call__(self, obs: FloatArray) -> Any:
+        """Return what the process answers as actions to obs (N, obs_dim).
+
+        Raises:
+            ZestError: it does not answer as it should.
+        """
+        return self._ask({"obs": obs.tolist()}, "actions")
+
+    def end(self) -> None:
+        """Close the process's stdin and wait for its end; kill it when that does not come."""
+        process, self._process = self._process, None
+        if process is None or process.stdin is None or process.stdout is None or self._errors is None:
+            return
+        with suppress(OSError):  # what was written last may have no reader any more
+            process.stdin.close()
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(GRACE)
+        _kill(process)
+        process.wait()
+        process.stdout.close()
+        self._errors.close()
+
+    def _ask(self, message: dict[str, Any], key: str) -> Any:
+        process = self._process
+        assert process is not None
+        assert process.stdin is not None
+        assert process.stdout is not None
+        late = threading.Event()
+
+        def give_up() -> None:
+            late.set()
+            _kill(process)  # what waits for its pipes, below, goes on
+
+        timer = threading.Timer(self._timeout, give_up)
+        timer.start()
+        try:
+            process.stdin.write(json.dumps(message).encode() + b"\n")
+            process.stdin.flush()
+            line = process.stdout.readline(MAX_ANSWER)
+        except BrokenPipeError:
+            line = b""
+        finally:
+            timer.cancel()
+        if late.is_set():
+            raise ZestError(
+                f"the policy's process gave no answer within {self._timeout:g} s and was killed; it must answer "
+                "each line of stdin by one line on stdout, and flush it. If it only needs longer, set "
+                f"{TIMEOUT_VARIABLE} (seconds){self._last_words()}"
+            )
+        if not line:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(GRACE)
+            code = process.poll()
+            how = "closed its stdout" if code is None else f"ended with exit code {code}"
+            raise ZestError(f"the policy's process {how} instead of answering{self._last_words()}")
+        try:
+            return json.loads(line)[key]
+        except (ValueError, TypeError, KeyError):
+            raise ZestError(
+                f'the policy\'s process must answer one line {{"{key}": …}} of JSON, got {line[:80]!r}; let it print '
+                f"everything else to stderr{self._last_words()}"
+            ) from None
+
+    def _last_words(self) -> str:
+        """Return the end of what the process wrote to stderr, for a message."""
+        assert self._errors is not None
+        size = self._errors.seek(0, os.SEEK_END)
+        self._errors.seek(max(0, size - 1000))
+        text = self._errors.read().decode(errors="replace").strip()
+        return f"; its stderr ends with:\n{text}" if text else ""
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """Kill the process and what it started."""
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)

@@ -1,0 +1,321 @@
+"""Policies that other programs trained, at work like our own.
+
+| spec | what acts |
+|---|---|
+| `torchscript:FILE.pt` | a TorchScript module or function, as d3rlpy's `save_policy("FILE.pt")` writes it |
+| `onnx:FILE.onnx` | an ONNX graph of one input (extra `foreign`); weights beside it are in `FILE.onnx.data` |
+| `d3rlpy:FILE.d3` | a model of d3rlpy, in the Python that has d3rlpy: a process |
+| `command:WORDS …` | any program that speaks the protocol of `zest_rl.agents.child` |
+| `NAME:REST` | what another package registers (group `zest_rl.policies`): a function from REST to a callable |
+
+All of them take raw observations (N, obs_dim) float32, as they stand in the dataset, and give actions (N, act_dim) in
+[-1, 1]. A callable, or a TorchScript module, with a method `begin(n_episodes)` is told that N new episodes start.
+
+Nothing is unpickled in this process; but TorchScript, ONNX, commands and packages run code of whoever made them, and
+d3rlpy unpickles its models in its own process.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import shlex
+import shutil
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from zest_rl.agents.base import check_obs
+from zest_rl.agents.child import Child
+from zest_rl.artifacts import hash_file
+from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.types import FloatArray
+
+FOREIGN = "foreign"
+"""What stands in the place of an agent in the meta of such a run."""
+ENTRY_POINTS = "zest_rl.policies"
+FAMILIES = ("torchscript", "onnx", "d3rlpy", "command")
+FOLDER = "policy"
+"""Of a run, where the files of the policy are."""
+TOLERANCE = 1e-5  # beyond the bounds of an action, before it counts as clipped
+
+Act = Callable[[FloatArray], Any]
+
+
+# ------------------------------------------------------------------------------------------------------------ what
+
+
+@dataclass(frozen=True)
+class Source:
+    """What acts, told apart by content."""
+
+    family: str
+    words: tuple[str, ...]
+    """A file of the run (``policy/FILE``), the words of a command, or what stands after ``NAME:``."""
+    files: Mapping[str, str]
+    """Path (from the run's folder, or absolute) → sha256, of all files that it is known to consist of."""
+    code: str = ""
+    """Entry point and version of what another package registered."""
+    originals: Mapping[str, Path] = field(default_factory=dict)
+    """Path in the run's folder → the file to be copied there."""
+
+    def described(self) -> dict[str, Any]:
+        """JSON-ready, for the meta of the run."""
+        return {"family": self.family, "words": list(self.words), "files": dict(self.files), "code": self.code}
+
+
+def identify(spec: str, python: str | None = None) -> Source:
+    """Find what a spec (see the table above) is about, and hash its files; nothing is run.
+
+    Args:
+        spec: the policy.
+        python: for ``d3rlpy:``, the Python that has d3rlpy.
+
+    Raises:
+        BadInput: unknown family, nothing after the colon, a missing file, or a Python that is missing or not wanted.
+    """
+    family, _, rest = spec.partition(":")
+    registered = _registered()
+    if family not in (*FAMILIES, *registered):
+        raise BadInput(f"unknown kind of policy {family!r}; {nearest(family, (*FAMILIES, *registered))}")
+    if not rest.strip() and family in FAMILIES:
+        raise BadInput(f"{family}: must be followed by {'a command' if family == 'command' else 'a file'}, got nothing")
+    if (python is not None) != (family == "d3rlpy"):
+        raise BadInput(
+            f"a Python belongs to d3rlpy:FILE.d3 and to nothing else, got {python!r} with {family}:; "
+            "give --python /path/to/bin/python of the environment that has d3rlpy"
+        )
+    if family == "command":
+        words = tuple(_absolute(word) for word in _split(rest))
+        return Source(family, words, {word: hash_file(Path(word)) for word in words if Path(word).is_file()})
+    if family not in FAMILIES:
+        entry = registered[family]
+        word = _absolute(rest)
+        files = {word: hash_file(Path(word))} if Path(word).is_file() else {}
+        version = entry.dist.version if entry.dist is not None else "unknown"
+        return Source(family, (word,), files, code=f"{entry.value} {version}")
+    path = Path(rest).expanduser()
+    if not path.is_file():
+        raise BadInput(f"there is no file {path}; give what the training program saved")
+    weights = path.with_name(f"{path.name}.data")  # where torch's exporter puts what an ONNX file refers to
+    parts = [path, weights] if family == "onnx" and weights.is_file() else [path]
+    originals = {f"{FOLDER}/{part.name}": part for part in parts}
+    runner = () if python is None else (_program(python),)
+    return Source(
+        family,
+        (*runner, f"{FOLDER}/{path.name}"),
+        {place: hash_file(part) for place, part in originals.items()},
+        originals=originals,
+    )
+
+
+def _registered() -> dict[str, importlib.metadata.EntryPoint]:
+    return {entry.name: entry for entry in importlib.metadata.entry_points(group=ENTRY_POINTS)}
+
+
+def _absolute(word: str) -> str:
+    """Name a file so that it is found from everywhere; leave other words alone."""
+    path = Path(word).expanduser()
+    return str(path.absolute()) if path.is_file() else word  # not resolved: a venv's python is a link
+
+
+def _split(command: str) -> list[str]:
+    try:
+        return shlex.split(command)
+    except ValueError as error:
+        raise BadInput(f"the command {command!r} cannot be read as a shell would: {error}") from error
+
+
+def _program(python: str) -> str:
+    found = shutil.which(Path(python).expanduser())
+    if found is None:
+        raise BadInput(f"there is no program {python!r}; give --python /path/to/bin/python, which has d3rlpy")
+    return str(Path(found).absolute())
+
+
+# ------------------------------------------------------------------------------------------------------------- act
+
+
+class ForeignPolicy:
+    """Somebody else's policy; it is asked for no return, and what it gives is checked."""
+
+    agent = FOREIGN
+    uses_return = False
+
+    def __init__(self, act: Act, meta: dict[str, Any]):
+        self.meta = meta
+        self._act = act
+        self._n_clipped = np.zeros(0, dtype=np.int64)
+
+    def begin(self, n_episodes: int, target_return: float | None = None) -> None:
+        """Start N episodes; the target return is not used.
+
+        Raises:
+            ZestError: the policy fails.
+        """
+        self._n_clipped = np.zeros(n_episodes, dtype=np.int64)
+        with self._named("begin"):
+            _call(self._act, "begin", n_episodes)
+
+    def act(self, obs: FloatArray) -> FloatArray:
+        """Return actions (N, act_dim) float32 for obs (N, obs_dim) float32, clipped to [-1, 1], which is counted.
+
+        Raises:
+            ZestError: the policy fails, or what it gives has another shape, or is not finite.
+        """
+        check_obs(obs, len(self._n_clipped), self.meta["obs_dim"])
+        with self._named(f"obs of shape {obs.shape}"):
+            actions: FloatArray = np.asarray(self._act(obs), dtype=np.float32)
+        wanted = (len(obs), self.meta["act_dim"])
+        if actions.shape != wanted:
+            raise ZestError(
+                f"{self._name} must give actions of shape {wanted} for obs {obs.shape}, got {actions.shape}"
+            )
+        bad = np.flatnonzero(~np.isfinite(actions).all(axis=1))
+        if len(bad):
+            raise ZestError(
+                f"{self._name} gave NaN or infinity as action of {len(bad)} of {len(actions)} episodes (the first is "
+                f"{bad[0]}); its weights are broken, or it was trained on observations of another scale"
+            )
+        self._n_clipped += (np.abs(actions) > 1 + TOLERANCE).any(axis=1)
+        clipped: FloatArray = actions.clip(-1, 1)
+        return clipped
+
+    def observe(self, rewards: FloatArray) -> None:
+        """Rewards are not handed on."""
+
+    def end(self) -> dict[str, NDArray[Any]]:
+        """End the policy's process, if it has one; return ``clipped`` (N,), the number of actions beyond [-1, 1]."""
+        _call(self._act, "end")
+        return {"clipped": self._n_clipped}
+
+    @property
+    def _name(self) -> str:
+        return f"policy {self.meta['name']!r} ({self.meta['policy']['family']})"
+
+    @contextmanager
+    def _named(self, doing: str) -> Iterator[None]:
+        """Say whose failure it is, whatever the other program raises."""
+        try:
+            yield
+        except ZestError as error:
+            raise ZestError(f"{self._name}: {error}") from error
+        except Exception as error:
+            last = (str(error).strip().splitlines() or [""])[-1]
+            raise ZestError(f"{self._name} failed on {doing} ({type(error).__name__}: {last})") from error
+
+
+def _call(policy: Act, method: str, *arguments: Any) -> None:
+    """Call a method that a policy may have."""
+    if callable(found := getattr(policy, method, None)):
+        found(*arguments)
+
+
+def load(run_dir: Path, meta: dict[str, Any], device: torch.device) -> ForeignPolicy:
+    """Return the policy of a run that `zest_rl.adoption.adopt` made.
+
+    Raises:
+        BadInput: a file cannot be read, or its family is not known here.
+        ZestError: a file is missing or was changed, or what reads it is not installed.
+    """
+    source = Source(**{**meta["policy"], "words": tuple(meta["policy"]["words"])})
+    for name, sha256 in source.files.items():
+        path = run_dir / name
+        if not path.is_file() or hash_file(path) != sha256:
+            raise ZestError(
+                f"{path} is missing or was changed since `zest adopt` saw it, which makes it another policy; restore "
+                "it, or adopt the new one"
+            )
+    here = {name: str(run_dir / name) for name in source.files}  # a path that is absolute stays as it is
+    words = [here.get(word, word) for word in source.words]
+    if source.family == "torchscript":
+        return ForeignPolicy(_read_torchscript(Path(words[0]), device), meta)
+    if source.family == "onnx":
+        return ForeignPolicy(_read_onnx(Path(words[0])), meta)
+    if source.family in FAMILIES:
+        if source.family == "d3rlpy":
+            words.insert(1, str(Path(__file__).with_name("serve_d3rlpy.py")))
+        return ForeignPolicy(Child(words, meta["obs_dim"], meta["act_dim"]), meta)
+    return ForeignPolicy(_build_registered(source), meta)
+
+
+def _read_torchscript(path: Path, device: torch.device) -> Act:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # torch would rather have another format, but this is used
+            module = torch.jit.load(str(path), map_location=device).eval()  # type: ignore[no-untyped-call]
+    except (RuntimeError, ValueError) as error:
+        raise BadInput(
+            f"{path.name} cannot be read as TorchScript; write it with torch.jit.save or d3rlpy's save_policy "
+            "(weights of torch.save are no policy: they do not say what is computed)"
+        ) from error
+    return _TorchScript(module, device)
+
+
+class _TorchScript:
+    def __init__(self, module: Any, device: torch.device):
+        self._module, self._device = module, device
+        if hasattr(module, "begin"):
+            self.begin = module.begin
+
+    @torch.no_grad()
+    def __call__(self, obs: FloatArray) -> NDArray[Any]:
+        actions: torch.Tensor = self._module(torch.from_numpy(obs).to(self._device))
+        return actions.float().cpu().numpy()
+
+
+def _read_onnx(path: Path) -> Act:
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise ZestError(
+            "ONNX policies need onnxruntime, which is not installed: pip install 'zest-rl[foreign]'"
+        ) from error
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its exceptions have no common class
+        raise BadInput(
+            f"{path.name} cannot be read as ONNX ({str(error).strip().splitlines()[-1]}); weights outside of the file "
+            f"are looked for in {path.name}.data alone"
+        ) from error
+    inputs = session.get_inputs()
+    if len(inputs) != 1:
+        raise BadInput(
+            f"an ONNX policy must have one input, the observations, got {', '.join(one.name for one in inputs)}; serve "
+            "others by command:"
+        )
+    run = partial(_run_onnx, session, inputs[0].name)
+    return run if inputs[0].shape[:1] != [1] else lambda obs: np.concatenate([run(row[None]) for row in obs])
+
+
+def _run_onnx(session: Any, name: str, obs: FloatArray) -> NDArray[Any]:
+    actions: NDArray[Any] = session.run(None, {name: obs})[0]
+    return actions
+
+
+def _build_registered(source: Source) -> Act:
+    """Return what a function of somebody else's package makes of the rest of the spec."""
+    entry = _registered().get(source.family)
+    if entry is None:
+        raise BadInput(
+            f"no installed package registers policies {source.family}:, as {source.code} did when this one was "
+            "adopted; install it again"
+        )
+    who = f"{entry.value}, which is registered for {entry.name}:,"
+    try:
+        act = entry.load()(source.words[0])
+    except Exception as error:
+        raise ZestError(f"{who} failed on {source.words[0]!r} ({type(error).__name__}: {error})") from error
+    if not callable(act):
+        raise ZestError(f"{who} must return a callable from obs to actions, got {type(act).__name__}")
+    built: Act = act
+    return built
