@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 import safetensors.torch
 import torch
@@ -229,8 +230,6 @@ def test_a_torchscript_module_with_a_memory_is_told_that_episodes_begin(
 
 @pytest.mark.parametrize("batch", ["N", 1], ids=["any-batch", "one-at-a-time"])
 def test_an_onnx_graph_acts_as_its_weights_say(batch: str | int, adopt: Callable[..., Path], tmp_path: Path) -> None:
-    pytest.importorskip("onnxruntime", reason="the extra `foreign` is not installed")
-    onnx = pytest.importorskip("onnx", reason="writing a graph needs onnx")
     weight = np.random.default_rng(0).normal(0, 0.1, (59, 9)).astype(np.float32)
     tensor = onnx.helper.make_tensor_value_info
     graph = onnx.helper.make_graph(
