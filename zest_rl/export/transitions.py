@@ -1,0 +1,146 @@
+"""Datasets → transitions, which every format is written from.
+
+Transition t of an episode is (o_t, a_t, r_t, o_{t+1}); nothing is shifted and nothing is lost. Ground truth and scores
+go along under names of their own, and are never the reward unless the dataset's rewards are them.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl import data
+from zest_rl.errors import BadInput, nearest
+from zest_rl.types import FloatArray
+
+Shape = Literal["step", "difference", "terminal"]
+
+
+@dataclass(frozen=True)
+class Rewards:
+    """How the dataset's rewards are handed on."""
+
+    shape: Shape = "step"
+    """``step``: as they are; ``difference``: their change; ``terminal``: the last one alone, 0 before."""
+    normalise: bool = False
+    """Shift and scale to [0, 1] over the dataset, after the shape was made; of ``terminal`` the last ones alone."""
+
+    def __post_init__(self) -> None:
+        if self.shape not in get_args(Shape):
+            raise BadInput(f"unknown shape of rewards {self.shape!r}; {nearest(self.shape, get_args(Shape))}")
+
+    def of(self, episodes: list[FloatArray], before: list[float]) -> list[FloatArray]:
+        """Shape and scale the rewards of all episodes.
+
+        Args:
+            episodes: (T,) float32 each.
+            before: what the frame before the first action is worth, which the first difference is against.
+
+        Raises:
+            BadInput: rewards that are all equal are to be normalised.
+        """
+        if self.shape == "difference":
+            episodes = [np.diff(one, prepend=np.float32(first)) for one, first in zip(episodes, before, strict=True)]
+        counted = [rewards[-1:] if self.shape == "terminal" else rewards for rewards in episodes]
+        if self.normalise:
+            every = np.concatenate(counted)
+            low, size = every.min(), np.ptp(every)
+            if size == 0:
+                raise BadInput("rewards that are all equal cannot be normalised; leave --normalise out")
+            counted = [((rewards - low) / size).astype(np.float32) for rewards in counted]
+        return [
+            np.concatenate([np.zeros(len(rewards) - len(own), np.float32), own])
+            for rewards, own in zip(episodes, counted, strict=True)
+        ]
+
+
+Transitions = dict[str, NDArray[Any]]
+"""Equally long arrays of one episode, see `transitions`."""
+AS_RECORDED = Rewards()
+
+
+def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transitions]:
+    """Read a dataset as transitions, one dict of equally long arrays per episode.
+
+    Args:
+        dataset_id: any dataset with flat observations.
+        rewards: how its rewards are handed on.
+
+    Returns:
+        observations, next_observations (T, obs_dim), actions (T, act_dim), rewards (T,) float32; terminals, timeouts
+        (T,) bool; and where they are recorded, zest_score, gt_reward (T,) float32 after the action, and
+        gt_episode_success (T,) bool, of the whole episode.
+
+    Raises:
+        BadInput: no such dataset, the rewards cannot be normalised, or are differences already.
+    """
+    episodes = data.read_episodes(dataset_id)
+    made = data.read_metadata(dataset_id).get("zest", {}).get("relabel")
+    before = [0.0] * len(episodes)
+    extras: dict[str, list[NDArray[Any]]] = {}
+    if made is not None:
+        if rewards.shape == "difference" and made["reward"] == "difference":
+            raise BadInput(f"the rewards of {dataset_id} are differences already; export them as they are")
+        scores = data.read_scores(dataset_id)
+        before = [float(score[0]) for score in scores]
+        extras["zest_score"] = [score[1:] for score in scores]
+    if data.has_ground_truth(dataset_id):
+        truth = data.read_ground_truth(dataset_id)
+        extras["gt_reward"] = [episode.rewards for episode in truth]
+        extras["gt_episode_success"] = [np.full(len(episode.rewards), episode.success) for episode in truth]
+    shaped = rewards.of([episode.rewards for episode in episodes], before)
+    found = []
+    for i, (episode, own) in enumerate(zip(episodes, shaped, strict=True)):
+        last = np.arange(len(episode)) == len(episode) - 1
+        found.append(
+            {
+                "observations": episode.obs[:-1],
+                "actions": episode.actions,
+                "rewards": own,
+                "next_observations": episode.obs[1:],
+                "terminals": last & episode.terminated,
+                "timeouts": last & (not episode.terminated),
+                **{name: values[i] for name, values in extras.items()},
+            }
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class Contents:
+    """All that a file of any format may hold."""
+
+    episodes: list[Transitions]
+    scores: list[FloatArray] | None
+    """(T+1,) each: ZeST scores of all frames, the first one too; None when the dataset was not relabeled."""
+    about: dict[str, Any]
+    """JSON-ready: what a reader may want to know of where the file comes from."""
+
+    def __len__(self) -> int:
+        return sum(len(episode["rewards"]) for episode in self.episodes)
+
+    @property
+    def flat(self) -> Transitions:
+        """The transitions of all episodes in one, and `episode` (N,) int64, which tells them apart."""
+        arrays = {name: np.concatenate([episode[name] for episode in self.episodes]) for name in self.episodes[0]}
+        arrays["episode"] = np.repeat(np.arange(len(self.episodes)), [len(one["rewards"]) for one in self.episodes])
+        return arrays
+
+
+def read(dataset_id: str, rewards: Rewards = AS_RECORDED) -> Contents:
+    """Read a dataset with all that goes into its files; arguments and errors as in `transitions`."""
+    episodes = transitions(dataset_id, rewards)
+    metadata = data.read_metadata(dataset_id)
+    about = {
+        "dataset": dataset_id,
+        "rewards": rewards.shape + (", normalised" if rewards.normalise else ""),
+        "env_spec": json.loads(metadata.get("env_spec") or "null"),
+        "ref_min_score": metadata.get("ref_min_score"),
+        "ref_max_score": metadata.get("ref_max_score"),
+        "zest": metadata.get("zest"),
+    }
+    return Contents(episodes, data.read_scores(dataset_id) if "zest_score" in episodes[0] else None, about)
