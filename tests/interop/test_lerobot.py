@@ -145,9 +145,9 @@ def test_act_trains(opened: Any) -> None:
     policy = ACTPolicy(config)
     prepare, _ = make_act_pre_post_processors(config, dataset_stats=dataset.meta.stats)
     optimizer = torch.optim.Adam(policy.parameters(), lr=1e-3)
-    loader = torch.utils.data.DataLoader(dataset, batch_size=32, shuffle=True, drop_last=True)
+    loader = torch.utils.data.DataLoader(dataset, batch_size=16, shuffle=True, drop_last=True)
     losses = []
-    for _ in range(12):
+    for _ in range(6):
         for batch in loader:
             loss, _ = policy.forward(prepare(batch))
             optimizer.zero_grad()

@@ -11,9 +11,8 @@ from conftest import Recorded, flat
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.data import SliceSampler, TensorDictReplayBuffer, TensorStorage
+from torchrl.data import ImmutableDatasetWriter, SliceSampler, TensorDictReplayBuffer, TensorStorage
 from torchrl.data.datasets import D4RLExperienceReplay, MinariExperienceReplay
-from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
 from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 from torchrl.objectives import IQLLoss, SoftUpdate
 
