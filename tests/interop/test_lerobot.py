@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -156,3 +158,18 @@ def test_act_trains(opened: Any) -> None:
             losses.append(loss.item())
     assert len(losses) >= 200
     assert np.mean(losses[-20:]) < 0.8 * np.mean(losses[:20])
+
+
+def test_its_own_command_trains_without_further_settings_of_the_dataset(exports: Path, tmp_path: Path) -> None:
+    small = ("--policy.dim_model=32", "--policy.n_heads=4", "--policy.dim_feedforward=64", "--policy.device=cpu")
+    done = subprocess.run(
+        [
+            Path(sys.executable).with_name("lerobot-train"), "--dataset.repo_id=zest/interop",
+            f"--dataset.root={exports / 'lerobot'}", "--policy.type=act", "--policy.push_to_hub=false", *small,
+            "--steps=20", "--batch_size=8", "--num_workers=0", "--save_checkpoint=false",
+            f"--output_dir={tmp_path / 'out'}",
+        ],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "End of training" in done.stdout + done.stderr

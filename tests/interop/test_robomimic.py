@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -88,3 +91,16 @@ def test_behaviour_cloning_trains(config: object, exports: Path) -> None:
             losses.append(model.log_info(model.train_on_batch(ready, epoch))["Loss"])
     assert len(losses) >= 200
     assert np.mean(losses[-20:]) < 0.8 * np.mean(losses[:20])
+
+
+def test_its_own_script_trains_by_the_config_of_the_documentation(exports: Path, tmp_path: Path) -> None:
+    config = {
+        "algo_name": "bc",
+        "experiment": {"rollout": {"enabled": False}, "epoch_every_n_steps": 20},
+        "train": {"output_dir": str(tmp_path / "out"), "num_epochs": 1, "cuda": False},
+        "observation": {"modalities": {"obs": {"low_dim": ["flat"]}}},
+    }
+    (tmp_path / "bc.json").write_text(json.dumps(config))
+    script = [sys.executable, "-m", "robomimic.scripts.train", "--config", str(tmp_path / "bc.json")]
+    done = subprocess.run([*script, "--dataset", str(exports / "robomimic")], capture_output=True, text=True)
+    assert "finished run successfully!" in done.stdout, done.stdout + done.stderr
