@@ -3,7 +3,7 @@ ZEST := .venv/bin/zest
 PYTEST := OMP_NUM_THREADS=1 .venv/bin/python -m pytest --durations=15
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow lint bench clean
+.PHONY: help setup demo test test-slow test-interop lint bench clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1|\2/' | column -t -s '|'
@@ -24,6 +24,10 @@ test: lint ## lint and all quick tests
 test-slow: setup ## the tests that take longer than a minute each
 	$(PYTEST) -m slow
 
+CONSUMERS := d3rlpy torchrl robomimic corl lerobot
+test-interop: setup ## exports in d3rlpy, TorchRL, robomimic, CORL, LeRobot, each in a venv of its own; CONSUMERS="…" for some
+	tests/interop/run.sh $(CONSUMERS)
+
 lint: setup ## ruff and mypy
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
@@ -32,6 +36,6 @@ lint: setup ## ruff and mypy
 bench: setup ## compare speeds with other implementations
 	.venv/bin/python -m benchmarks
 
-clean: ## remove caches and builds; keeps .venv, runs and datasets
+clean: ## remove caches and builds; keeps .venv, .venvs, runs and datasets
 	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
-	find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +
+	find . -name __pycache__ -not -path './.venv*/*' -prune -exec rm -rf {} +

@@ -17,6 +17,10 @@ settings.register_profile("zest", deadline=None, derandomize=True)  # a busy mac
 settings.load_profile("zest")
 
 
+collect_ignore = ["interop"]
+"""Tests against libraries that need environments of their own: `make test-interop`."""
+
+
 @pytest.fixture(scope="session")
 def visual_tasks() -> Path:
     """Folder of the Visual Tasks Dataset, which the project may not redistribute."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,9 +12,10 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from pyarrow import parquet
 
 from zest_rl import cli, data
-from zest_rl.errors import BadInput
+from zest_rl.errors import BadInput, ZestError
 from zest_rl.export import Rewards, export, transitions
 from zest_rl.frames import Views
 from zest_rl.relabel import relabel
@@ -100,6 +103,87 @@ def test_robomimic_files_hold_one_group_per_episode(scored: str, tmp_path: Path)
         assert not masks["train"] & masks["valid"]
 
 
+def test_d3rlpy_files_hold_what_its_loader_asks_for(scored: str, tmp_path: Path) -> None:
+    path = export(scored, "d3rlpy", tmp_path / "data.h5").path
+    with h5py.File(path) as file:
+        assert file["columns"][()].tolist() == [b"observations", b"actions", b"rewards", b"terminated"]
+        assert (file["num_episodes"][()], file["version"][()]) == (4, b"2.1")
+        for i, episode in enumerate(transitions(scored)):
+            np.testing.assert_array_equal(file[f"observations_{i}"], episode["observations"])
+            np.testing.assert_array_equal(file[f"rewards_{i}"], episode["rewards"][:, None])
+            np.testing.assert_array_equal(file[f"zest_score_{i}"], episode["zest_score"])
+            assert not file[f"terminated_{i}"][()]
+
+
+def test_torchrl_folders_hold_a_raw_file_per_entry(scored: str, tmp_path: Path) -> None:
+    written = export(scored, "torchrl", tmp_path / "data")
+    episodes = transitions(scored)
+    root, after = (json.loads((written.path / name).read_text()) for name in ("meta.json", "next/meta.json"))
+    assert root["shape"] == after["shape"] == [400]
+    assert root["next"] == {"type": "TensorDict"}
+    assert after["reward"] == {"device": "cpu", "shape": [400, 1], "dtype": "torch.float32", "is_nested": False}
+    reward = np.fromfile(written.path / "next/reward.memmap", np.float32)
+    np.testing.assert_array_equal(reward, np.concatenate([episode["rewards"] for episode in episodes]))
+    obs = np.fromfile(written.path / "next/observation.memmap", np.float32).reshape(after["observation"]["shape"])
+    np.testing.assert_array_equal(obs, np.concatenate([episode["next_observations"] for episode in episodes]))
+    assert np.fromfile(written.path / "next/truncated.memmap", bool).sum() == 4
+    assert written.n_bytes == sum(file.stat().st_size for file in written.path.rglob("*") if file.is_file())
+
+
+def test_lerobot_folders_hold_a_row_per_frame_and_progress_beside_them(scored: str, tmp_path: Path) -> None:
+    folder = export(scored, "lerobot", tmp_path / "data", fps=10).path
+    rows = parquet.read_table(folder / "data/chunk-000/file-000.parquet").to_pydict()
+    episodes = transitions(scored)
+    assert rows["next.reward"] == [float(reward) for episode in episodes for reward in episode["rewards"]]
+    assert rows["observation.state"][101] == episodes[1]["observations"][1].tolist()
+    assert rows["next.observation.state"][99] == episodes[0]["next_observations"][-1].tolist()
+    assert (rows["episode_index"][101], rows["frame_index"][101], rows["index"][101]) == (1, 1, 101)
+    assert rows["timestamp"][101] == pytest.approx(0.1)
+    info = json.loads((folder / "meta/info.json").read_text())
+    assert (info["fps"], info["total_episodes"], info["total_frames"]) == (10, 4, 400)
+    assert set(info["features"]) == set(rows)
+    scores = np.concatenate([score[:-1] for score in data.read_scores(scored)])
+    progress = parquet.read_table(folder / "sarm_progress.parquet").to_pydict()
+    np.testing.assert_array_equal(progress["zest_score"], scores)
+    assert (min(progress["progress_sparse"]), max(progress["progress_sparse"])) == (0, 1)
+    alone = export(scored, "lerobot-progress", tmp_path / "progress.parquet").path
+    assert parquet.read_table(alone).to_pydict() == progress
+    with pytest.raises(BadInput, match="fps must be at least 1, got 0"):
+        export(scored, "lerobot", tmp_path / "other", fps=0)
+    assert not (tmp_path / "other").exists()
+
+
+def test_progress_needs_scores_and_takes_no_shape(collected: str, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="relabel it with `zest relabel`"):
+        export(collected, "lerobot-progress", tmp_path / "x")
+    with pytest.raises(BadInput, match="leave --shape and --normalise out"):
+        export(collected, "lerobot-progress", tmp_path / "x", Rewards("difference"))
+    assert not (tmp_path / "x").exists()
+
+
+def test_without_pyarrow_the_extra_is_named(collected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ZestError, match=r"pip install 'zest-rl\[export\]'"):
+        export(collected, "lerobot", tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+
+
+def test_exporting_needs_little_more_than_numpy_and_h5py(collected: str, tmp_path: Path) -> None:
+    """So that it works beside a library whose pins exclude ours."""
+    code = (
+        "import sys; from pathlib import Path; from zest_rl.export import export, to_d3rlpy, to_torchrl; "
+        "formats = ('npz', 'd4rl', 'robomimic', 'd3rlpy', 'torchrl'); "
+        "[export(sys.argv[1], to, Path(sys.argv[2]) / to) for to in formats]; "
+        "print(*{name.split('.')[0] for name, module in sys.modules.items() "
+        "if 'site-packages' in (getattr(module, '__file__', None) or '')})"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, collected, str(tmp_path)], capture_output=True, text=True, check=True
+    )
+    loaded = {name for name in done.stdout.split() if not name.startswith("_")}
+    assert {"h5py", "numpy"} <= loaded <= {"h5py", "numpy", "filelock", "zest_rl"}
+
+
 def test_rewards_take_the_shape_that_is_asked_for() -> None:
     rewards = [np.array([0.0, 1.0, 3.0], np.float32), np.array([2.0, -1.0], np.float32)]
 
@@ -145,9 +229,10 @@ def test_an_episode_that_ended_by_itself_is_no_timeout(collected: str, to: str, 
         assert file["timeouts"][()].sum() == 3
 
 
-def test_a_format_that_would_lose_the_rewards_is_refused(collected: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("to", ["d4rl", "d3rlpy"])
+def test_a_format_that_would_lose_the_rewards_is_refused(collected: str, to: str, tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="leaves out the transition at a time limit"):
-        export(collected, "d4rl", tmp_path / "x", Rewards("terminal"))
+        export(collected, to, tmp_path / "x", Rewards("terminal"))  # type: ignore[arg-type]
     assert not (tmp_path / "x").exists()
 
 
@@ -182,5 +267,6 @@ def test_the_verb_writes_beside_you_and_over_nothing(
     assert cli.main(["export", collected, "--to", "d4rl"]) == 2
     assert "exists; delete it, or choose another --output" in capsys.readouterr().err
     assert zest("export", collected)["file"] == "kitchen-micro-tiny-v0.npz"
+    assert zest("export", collected, "--to", "torchrl")["file"] == "kitchen-micro-tiny-v0.torchrl"
     with pytest.raises(BadInput, match="unknown format 'rlds'"):
         export(collected, "rlds", tmp_path / "x")  # type: ignore[arg-type]

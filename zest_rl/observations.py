@@ -14,7 +14,6 @@ from typing import Any
 import h5py
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from zest_rl.errors import BadInput
 from zest_rl.types import FloatArray, Frame
@@ -74,6 +73,8 @@ def read_pictures(entry: h5py.Dataset, rows: slice) -> list[Frame]:
         )
     stored = entry[rows]
     if _is_jpeg(entry):
+        from PIL import Image  # environments that only export may lack it
+
         return [np.asarray(Image.open(io.BytesIO(bytes(row))).convert("RGB")) for row in stored]
     return [as_frame(picture, entry.name) for picture in stored]
 

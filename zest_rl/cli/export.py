@@ -1,4 +1,4 @@
-"""``zest export``: a dataset → a file that other offline-RL code reads."""
+"""``zest export``: a dataset → files that other offline-RL code reads."""
 
 from __future__ import annotations
 
@@ -10,11 +10,25 @@ import tyro
 
 from zest_rl.cli.ui import Ui
 
-SUFFIXES = {"npz": "npz", "d4rl": "hdf5", "robomimic": "hdf5"}
+SUFFIXES = {
+    "npz": "npz",
+    "d4rl": "d4rl.hdf5",
+    "robomimic": "robomimic.hdf5",
+    "d3rlpy": "d3rlpy.h5",
+    "torchrl": "torchrl",
+    "lerobot": "lerobot",
+    "lerobot-progress": "progress.parquet",
+}
 NEXT = {
     "npz": "python -c \"import numpy; print({{k: v.shape for k, v in numpy.load('{path}').items()}})\"",
     "d4rl": "python -c \"import h5py; print({{k: v.shape for k, v in h5py.File('{path}').items()}})\"",
     "robomimic": "python -m robomimic.scripts.get_dataset_info --dataset {path}",
+    "d3rlpy": 'python -c "from d3rlpy.dataset import ReplayBuffer, InfiniteBuffer; '
+    "print(ReplayBuffer.load(open('{path}', 'rb'), InfiniteBuffer()).dataset_info)\"",
+    "torchrl": "python -c \"from tensordict import TensorDict; print(TensorDict.load_memmap('{path}'))\"",
+    "lerobot": 'python -c "from lerobot.datasets.lerobot_dataset import LeRobotDataset; '
+    "print(LeRobotDataset('zest/{name}', root='{path}'))\"",
+    "lerobot-progress": "cp {path} YOUR_LEROBOT_DATASET/sarm_progress.parquet",
 }
 
 
@@ -26,15 +40,19 @@ class Config:
 
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
     """Minari dataset, relabeled or not."""
-    to: Literal["npz", "d4rl", "robomimic"] = "npz"
+    to: Literal["npz", "d4rl", "robomimic", "d3rlpy", "torchrl", "lerobot", "lerobot-progress"] = "npz"
     """Flat arrays; HDF5 for d4rl.qlearning_dataset(env, dataset=…), which leaves out the last transition before a time
-    limit; or robomimic's HDF5 (config: low_dim ["flat"], experiment.rollout.enabled false)."""
+    limit; robomimic's HDF5 (config: low_dim ["flat"], experiment.rollout.enabled false); HDF5 for d3rlpy's
+    ReplayBuffer.load; a folder for TensorDict.load_memmap; a LeRobotDataset v3.0; or the scores alone, as LeRobot's
+    sarm_progress.parquet. The last two need zest-rl[lerobot]. docs/interop.md has a recipe for each."""
     output: Path | None = None
-    """The file; default DATASET.npz or DATASET.FORMAT.hdf5 here."""
+    """The file or folder; default DATASET.FORMAT here."""
     shape: Literal["step", "difference", "terminal"] = "step"
     """The rewards as they are, their change, or the last one alone."""
     normalise: bool = False
     """Shift and scale the rewards to [0, 1] over the dataset."""
+    fps: int = 12
+    """Steps per second, which LeRobot's timestamps are made of; the kitchen's by default."""
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
@@ -42,13 +60,13 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     from zest_rl.export import Rewards, export
 
     name = config.dataset.split("/")[-1]
-    default = f"{name}.npz" if config.to == "npz" else f"{name}.{config.to}.{SUFFIXES[config.to]}"
-    written = export(config.dataset, config.to, config.output or Path(default), Rewards(config.shape, config.normalise))
+    path = config.output or Path(f"{name}.{SUFFIXES[config.to]}")
+    written = export(config.dataset, config.to, path, Rewards(config.shape, config.normalise), config.fps)
     return {
         "file": str(written.path),
         "n_episodes": written.n_episodes,
         "n_transitions": written.n_transitions,
         "arrays": sorted(written.arrays),
-        "bytes": written.path.stat().st_size,
-        "next": NEXT[config.to].format(path=written.path),
+        "bytes": written.n_bytes,
+        "next": NEXT[config.to].format(path=written.path, name=name),
     }

@@ -1,0 +1,56 @@
+"""d3rlpy's replay buffers: the HDF5 file that `ReplayBuffer.load` reads, or the buffer itself.
+
+An episode there has as many observations as actions, so the last observation is left out, and d3rlpy's Q-learning takes
+the last step of an episode for a transition only when it is terminal. Its own loader of Minari datasets is not to be
+used: d3rlpy 2.8.1's `get_minari` shifts episode i by i observations.
+
+Layout: d3rlpy 2.8.1, `d3rlpy/dataset/io.py`, `dump` and `load`, DATASET_VERSION 2.1.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import h5py
+
+from zest_rl.export.transitions import AS_RECORDED, Contents, Rewards, Transitions, transitions
+
+if TYPE_CHECKING:
+    import d3rlpy
+
+VERSION = "2.1"
+
+
+def fields(episode: Transitions) -> dict[str, object]:
+    """The fields of d3rlpy's `Episode`: observations (T, obs_dim), actions, rewards (T, 1), terminated."""
+    return {
+        "observations": episode["observations"],
+        "actions": episode["actions"],
+        "rewards": episode["rewards"][:, None],
+        "terminated": bool(episode["terminals"][-1]),
+    }
+
+
+def write(path: Path, contents: Contents) -> None:
+    """Write `NAME_I` of every episode; what is not in ``columns``, such as ``zest_score_I``, d3rlpy passes over."""
+    with h5py.File(path, "w") as file:
+        file["columns"] = list(fields(contents.episodes[0]))
+        file["num_episodes"] = len(contents.episodes)
+        file["version"] = VERSION
+        for i, episode in enumerate(contents.episodes):
+            for name, values in {**episode, **fields(episode)}.items():
+                file[f"{name}_{i}"] = values
+        file.attrs["about"] = json.dumps(contents.about)
+
+
+def to_d3rlpy(dataset_id: str, rewards: Rewards = AS_RECORDED) -> d3rlpy.dataset.ReplayBuffer:
+    """Read a dataset as a d3rlpy `ReplayBuffer`, without a file; arguments and errors as in `transitions`.
+
+    Raises:
+        ImportError: d3rlpy is not installed.
+    """
+    from d3rlpy.dataset import Episode, create_infinite_replay_buffer
+
+    return create_infinite_replay_buffer([Episode(**fields(one)) for one in transitions(dataset_id, rewards)])

@@ -1,0 +1,25 @@
+"""Equally long arrays of all transitions: NumPy's npz, and HDF5 as D4RL's and CORL's loaders read it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from zest_rl.export.transitions import Contents
+
+
+def write_npz(path: Path, contents: Contents) -> None:
+    """Write the arrays by the names of `transitions`, and ``about`` as JSON."""
+    with path.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, about=np.array(json.dumps(contents.about)), **contents.flat)
+
+
+def write_d4rl(path: Path, contents: Contents) -> None:
+    """Write the same arrays at the root of an HDF5 file, and ``about`` as an attribute."""
+    with h5py.File(path, "w") as file:
+        for name, values in contents.flat.items():
+            file.create_dataset(name, data=values, compression="gzip")
+        file.attrs["about"] = json.dumps(contents.about)

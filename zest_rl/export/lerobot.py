@@ -1,0 +1,209 @@
+"""LeRobot's dataset folder of format v3.0, without videos, and its side-car of progress per frame.
+
+Frame t of an episode of T actions holds o_t, a_t and, under ``next.``, what follows: r_t, o_{t+1}, the ends, the ZeST
+score and the ground truth. o_t stands there twice, as ``observation.state`` and ``observation.environment_state``:
+LeRobot's policies refuse to train without either a camera or the latter. ``next.done`` marks the last frame whatever
+ended the episode, as LeRobot's recordings have it; ``next.truncated`` those that a time limit ended.
+
+The side-car ``sarm_progress.parquet`` is what LeRobot's reward-aligned behaviour cloning weighs frames by
+(``--sample_weighting.type rabc``): ``progress_sparse`` of frame t is the ZeST score of o_t, scaled to [0, 1] over the
+dataset.
+
+Layout: lerobot 0.6.1, `datasets/dataset_metadata.py`, `datasets/io_utils.py`, `rewards/sarm/rabc.py`.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl import artifacts
+from zest_rl.errors import BadInput, ZestError
+from zest_rl.export.transitions import Contents, Transitions
+from zest_rl.tasks import TASKS
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+FPS = 12
+"""Of the kitchen: 12.5 steps a second, which Gymnasium's ``render_fps`` and LeRobot want as a whole number."""
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+EPISODES_FILE, DATA_FILE = "meta/episodes/chunk-000/file-000.parquet", "data/chunk-000/file-000.parquet"
+TASKS_FILE, PROGRESS_FILE = "meta/tasks.parquet", "sarm_progress.parquet"
+QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+
+Columns = dict[str, NDArray[Any]]
+"""Equally long arrays (T,) or (T, dim) by LeRobot's names."""
+
+
+def write(folder: Path, contents: Contents, fps: int = FPS) -> None:
+    """Write a dataset, with the side-car when the contents have scores.
+
+    Raises:
+        BadInput: `fps` is below 1.
+        ZestError: pyarrow is not installed.
+    """
+    if fps < 1:
+        raise BadInput(f"fps must be at least 1, got {fps}; give the steps per second of the robot")
+    flat = contents.flat
+    lengths = np.bincount(flat["episode"])
+    starts = np.cumsum(lengths) - lengths
+    columns = _columns(flat, starts, fps)
+    rows = [slice(start, start + length) for start, length in zip(starts.tolist(), lengths.tolist(), strict=True)]
+    task = _task(contents.about)
+    for name in (DATA_FILE, EPISODES_FILE):
+        (folder / name).parent.mkdir(parents=True)
+    _write_parquet(folder / DATA_FILE, _table(columns), rows)
+    _write_parquet(folder / EPISODES_FILE, _episodes(columns, rows, task))
+    _write_parquet(folder / TASKS_FILE, _tasks(task))
+    if contents.scores is not None:
+        write_progress(folder / PROGRESS_FILE, contents)
+    artifacts.write_json(folder / "meta/stats.json", {name: _stats(values) for name, values in columns.items()})
+    artifacts.write_json(folder / "meta/zest.json", contents.about)
+    info = {
+        "codebase_version": "v3.0",
+        "robot_type": None,
+        "total_episodes": len(rows),
+        "total_frames": len(contents),
+        "total_tasks": 1,
+        "chunks_size": 1000,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "fps": fps,
+        "splits": {"train": f"0:{len(rows)}"},
+        "data_path": DATA_PATH,
+        "video_path": None,
+        "features": {
+            name: {"dtype": values.dtype.name, "shape": [_width(values)], "names": None}
+            for name, values in columns.items()
+        },
+    }
+    artifacts.write_json(folder / "meta/info.json", info)
+
+
+def write_progress(path: Path, contents: Contents) -> None:
+    """Write the side-car alone: index, episode_index, frame_index, progress_sparse, and zest_score as it is.
+
+    Raises:
+        BadInput: the dataset was not relabeled.
+        ZestError: pyarrow is not installed.
+    """
+    if contents.scores is None:
+        raise BadInput("progress is read from ZeST scores, which this dataset has not; relabel it with `zest relabel`")
+    scores = np.concatenate([score[:-1] for score in contents.scores])
+    low, size = scores.min(), np.ptp(scores)
+    lengths = [len(score) - 1 for score in contents.scores]
+    _write_parquet(
+        path,
+        _table(
+            {
+                "index": np.arange(len(scores)),
+                "episode_index": np.repeat(np.arange(len(lengths)), lengths),
+                "frame_index": np.concatenate([np.arange(length) for length in lengths]),
+                "progress_sparse": ((scores - low) / (size or 1)).astype(np.float32),
+                "zest_score": scores,
+            }
+        ),
+    )
+
+
+def _columns(flat: Transitions, starts: NDArray[Any], fps: int) -> Columns:
+    index = np.arange(len(flat["rewards"]))
+    frame = index - starts[flat["episode"]]
+    columns = {
+        "observation.state": flat["observations"],
+        "observation.environment_state": flat["observations"],
+        "action": flat["actions"],
+        "next.observation.state": flat["next_observations"],
+        "next.reward": flat["rewards"],
+        "next.done": flat["terminals"] | flat["timeouts"],
+        "next.truncated": flat["timeouts"],
+        "timestamp": (frame / fps).astype(np.float32),
+        "frame_index": frame,
+        "episode_index": flat["episode"],
+        "index": index,
+        "task_index": np.zeros_like(index),
+    }
+    extras = {
+        "next.zest_score": "zest_score",
+        "next.gt_reward": "gt_reward",
+        "gt_episode_success": "gt_episode_success",
+    }
+    return columns | {name: flat[key] for name, key in extras.items() if key in flat}
+
+
+def _task(about: dict[str, Any]) -> str:
+    """The task in words, as policies that read language are told it."""
+    spec = about["env_spec"] or {}
+    own = TASKS.get(spec.get("kwargs", {}).get("task"))
+    return own.goal_text if own else str(spec.get("id") or about["dataset"])
+
+
+def _width(values: NDArray[Any]) -> int:
+    return values.shape[1] if values.ndim == 2 else 1
+
+
+def _stats(values: NDArray[Any]) -> dict[str, list[Any]]:
+    """Statistics per dimension, over exact quantiles (LeRobot's own are of histograms)."""
+    each = values.reshape(len(values), -1).astype(np.float64)
+    found = {"min": each.min(0), "max": each.max(0), "mean": each.mean(0), "std": each.std(0)}
+    found |= {name: np.quantile(each, share, axis=0) for name, share in QUANTILES.items()}
+    return {name: list(map(float, numbers)) for name, numbers in found.items()} | {"count": [len(each)]}
+
+
+def _pyarrow() -> Any:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise ZestError("LeRobot's files are Parquet, which needs pyarrow; pip install 'zest-rl[lerobot]'") from error
+    return pyarrow
+
+
+def _table(columns: Columns) -> pa.Table:
+    """Vectors become lists of fixed size, and vectors of one number plain numbers, as LeRobot has them."""
+    arrow = _pyarrow()
+    arrays = {}
+    for name, values in columns.items():
+        numbers = arrow.array(values.reshape(-1))
+        width = _width(values)
+        arrays[name] = numbers if width == 1 else arrow.FixedSizeListArray.from_arrays(numbers, width)
+    return arrow.table(arrays)
+
+
+def _episodes(columns: Columns, rows: list[slice], task: str) -> pa.Table:
+    found: dict[str, list[Any]] = {
+        "episode_index": list(range(len(rows))),
+        "tasks": [[task]] * len(rows),
+        "length": [row.stop - row.start for row in rows],
+        "dataset_from_index": [row.start for row in rows],
+        "dataset_to_index": [row.stop for row in rows],
+    }
+    for place in ("data/chunk_index", "data/file_index", "meta/episodes/chunk_index", "meta/episodes/file_index"):
+        found[place] = [0] * len(rows)
+    for name, values in columns.items():
+        each = [_stats(values[row]) for row in rows]
+        found |= {f"stats/{name}/{which}": [stats[which] for stats in each] for which in each[0]}
+    return _pyarrow().table(found)
+
+
+def _tasks(task: str) -> pa.Table:
+    """One row; pandas, by which LeRobot reads it, is told that the task is the index."""
+    columns = [
+        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}
+        for name, kind, numpy_type in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+    ]
+    pandas = {"index_columns": ["task"], "column_indexes": [], "columns": columns}
+    table = _pyarrow().table({"task_index": [0], "task": [task]})
+    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+
+
+def _write_parquet(path: Path, table: pa.Table, rows: list[slice] | None = None) -> None:
+    """One row group, or one for each of `rows`, so that an episode can be read alone."""
+    with _pyarrow().parquet.ParquetWriter(path, table.schema) as writer:
+        for row in rows or [slice(0, len(table))]:
+            writer.write_table(table.slice(row.start, row.stop - row.start))

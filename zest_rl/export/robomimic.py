@@ -1,0 +1,48 @@
+"""robomimic's HDF5: one group per demonstration, and masks of those to train and to validate on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from zest_rl.errors import BadInput
+from zest_rl.export.transitions import Contents
+
+VALID_SHARE = 0.1
+"""Of the episodes, for the mask ``valid``."""
+
+
+def write(path: Path, contents: Contents) -> None:
+    """Write ``data/demo_I`` with ``obs/flat`` and ``next_obs/flat``; ``dones`` are terminals and timeouts alike.
+
+    Raises:
+        BadInput: one episode alone, which cannot be parted.
+    """
+    episodes = contents.episodes
+    if len(episodes) < 2:
+        raise BadInput("robomimic's masks part the episodes into train and valid, which takes 2 or more; got 1")
+    names = [f"demo_{i}" for i in range(len(episodes))]
+    with h5py.File(path, "w") as file:
+        group = file.create_group("data")
+        for name, episode in zip(names, episodes, strict=True):
+            demo = group.create_group(name)
+            demo.attrs["num_samples"] = len(episode["rewards"])
+            demo.create_dataset("obs/flat", data=episode["observations"])
+            demo.create_dataset("next_obs/flat", data=episode["next_observations"])
+            for key in ("actions", "rewards"):
+                demo.create_dataset(key, data=episode[key])
+            demo.create_dataset("dones", data=(episode["terminals"] | episode["timeouts"]).astype(np.int64))
+            for key in sorted(episode.keys() - {"observations", "next_observations", "actions", "rewards"}):
+                demo.create_dataset(key, data=episode[key])
+        group.attrs["total"] = len(contents)
+        spec = contents.about["env_spec"] or {"id": "unknown"}
+        env = {"env_name": spec["id"], "type": 2, "env_kwargs": spec.get("kwargs", {})}  # 2: a Gym environment
+        group.attrs["env_args"] = json.dumps(env)
+        group.attrs["about"] = json.dumps(contents.about)
+        n_valid = max(1, round(VALID_SHARE * len(names)))
+        chosen = set(np.random.default_rng(0).permutation(len(names))[:n_valid].tolist())
+        for mask, members in (("valid", chosen), ("train", set(range(len(names))) - chosen)):
+            file.create_dataset(f"mask/{mask}", data=np.array([names[i].encode() for i in sorted(members)], dtype="S"))
