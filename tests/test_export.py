@@ -163,7 +163,7 @@ def test_progress_needs_scores_and_takes_no_shape(collected: str, tmp_path: Path
 
 def test_without_pyarrow_the_extra_is_named(collected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(ZestError, match=r"pip install 'zest-rl\[export\]'"):
+    with pytest.raises(ZestError, match=r"pip install 'zest-rl\[lerobot\]'"):
         export(collected, "lerobot", tmp_path / "x")
     assert not (tmp_path / "x").exists()
 
