@@ -33,6 +33,7 @@ from zest_rl.sources import open_source
 from zest_rl.sources.pictures import Pictures
 from zest_rl.types import FloatArray, Frame
 
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari")  # datasets of tests have no author
 Run = Callable[..., dict[str, Any]]
 LENGTHS = (4, 6, 4)
 SIDE = 64

@@ -12,7 +12,7 @@ from conftest import COLLECTED
 
 from zest_rl import artifacts, data
 from zest_rl.cli import collect as collect_verb
-from zest_rl.cli import follow, train
+from zest_rl.cli import follow, select, train
 from zest_rl.cli.plans import read_plan
 from zest_rl.cli.recipes import parse_config
 from zest_rl.cli.studies import read_study
@@ -162,7 +162,8 @@ def test_a_recipe_of_a_verb_is_valid(path: Path) -> None:
     configs: dict[str, Any] = {"collect": collect_verb.Config}
     configs |= {f"train {agent}": config for agent, config in train.CONFIGS.items()}
     configs |= {f"follow {what}": config for what, config in follow.CONFIGS.items()}
-    words = ["zest/some-v0"] if verb.startswith("train") else []
+    configs |= {f"select {what}": config for what, config in select.CONFIGS.items()}
+    words = ["zest/some-v0"] if verb.startswith(("train", "select")) else []
     config, _ = parse_config(configs[verb], [*words, "--recipe", str(path)], verb)
     assert isinstance(config, configs[verb])
 

@@ -30,6 +30,7 @@ from zest_rl.agents.foreign import identify
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.evaluation import EPISODES_PER_JOB, Evaluation, EvaluationConfig, evaluate, evaluation_folder
 
+pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit:FutureWarning")  # d3rlpy writes TorchScript
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 TWO = EvaluationConfig(n_episodes=2, seed=11)
 Verb = Callable[..., dict[str, Any]]
@@ -425,11 +426,23 @@ def test_a_folder_that_holds_something_else_is_refused(
         ("torchscript:x.pt", "python3", "got 'python3' with torchscript:"),
         (f"d3rlpy:{__file__}", "/no/python", "there is no program '/no/python'; give --python /path/to/bin/python"),
         ("command:'", None, 'the command "\'" cannot be read as a shell would: No closing quotation'),
+        (f"command:python3 serve.py --weights={Path(__file__).parent}", None, "is a folder; name the files"),
     ],
 )
 def test_a_spec_that_names_nothing_is_refused(spec: str, python: str | None, message: str) -> None:
     with pytest.raises(BadInput, match=re.escape(message)):
         identify(spec, python)
+
+
+def test_files_that_a_command_names_are_hashed_wherever_they_stand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("serve.py", "w.pt"):
+        (tmp_path / name).write_text(name)
+    source = identify("command:python3 serve.py --weights=w.pt -c ~nobody/x " + 300 * "x")
+    assert source.words[:3] == ("python3", str(tmp_path / "serve.py"), f"--weights={tmp_path / 'w.pt'}")
+    assert source.files == {str(path): artifacts.hash_file(path) for path in (tmp_path / "serve.py", tmp_path / "w.pt")}
 
 
 def test_what_cannot_be_read_is_refused_and_leaves_no_folder(

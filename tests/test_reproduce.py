@@ -322,6 +322,11 @@ def test_one_task_may_have_several_datasets(tmp_path: Path) -> None:
         ('agent = "bc"', 'agent = "bc"\npolicy = "onnx:x"', "either an agent or a policy, got 'bc' and 'onnx:x'"),
         ('agent = "bc"', 'policy = "onnx:x"\nhidden_size = 1', "[methods.'BC']: unknown key 'hidden_size'"),
         ('agent = "bc"', 'policy = "onnx:x"\nseed = 1', "'seed' is not for a recipe to set"),
+        (
+            "[relabel]",
+            '[tasks.micro]\n[tasks.sdoor]\n[methods.A]\npolicy = "onnx:x"\n[relabel]',
+            "must hold {task}, got",
+        ),
         ("seeds = [0]", 'seeds = [0, 1]\nmethods.A.policy = "onnx:x"', "the policy must hold {seed}, got 'onnx:x'"),
     ],
 )

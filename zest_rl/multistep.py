@@ -82,6 +82,7 @@ def perform(tasks: Sequence[str], seed: int) -> Performance:
             )
         done_at[task] = len(states) - 1
         before = kitchen.data
+        env.close()
     return Performance(np.stack(states), done_at)
 
 
@@ -105,16 +106,17 @@ class Followed:
         return int(np.argmax(self.scores))
 
     @property
-    def rises_at(self) -> int:
-        """First step at which the score is half-way from its first to its highest value, or beyond."""
+    def rises_at(self) -> int | None:
+        """First step at which the score is half-way from its first to its highest value; None when it never rises."""
         half = (self.scores[0] + self.scores.max()) / 2
-        return int(np.argmax(self.scores >= half)) if self.highest_at > 0 else 0
+        return int(np.argmax(self.scores >= half)) if self.highest_at > 0 else None
 
 
 def rise_in_order(followed: Sequence[Followed]) -> bool:
-    """Whether the scores rise one after another, in the order of the sub-goals."""
+    """Whether all scores rise, one after another in the order of the sub-goals."""
     rises = [one.rises_at for one in followed]
-    return all(earlier < later for earlier, later in pairwise(rises))
+    known = [step for step in rises if step is not None]
+    return len(known) == len(rises) and all(earlier < later for earlier, later in pairwise(known))
 
 
 def follow_performance(
@@ -200,7 +202,8 @@ def follow_report(title: str, followed: Sequence[Followed], details: dict[str, o
         title=title,
         summary_sentence=f"The scores {order} the sub-goals: "
         + ", ".join(
-            f"{one.name} at step {one.rises_at}" + ("" if one.done_at is None else f" (done at {one.done_at})")
+            f"{one.name} {'never' if one.rises_at is None else f'at step {one.rises_at}'}"
+            + ("" if one.done_at is None else f" (done at {one.done_at})")
             for one in followed
         )
         + ".",

@@ -21,7 +21,7 @@ import importlib.metadata
 import shlex
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -94,11 +94,11 @@ def identify(spec: str, python: str | None = None) -> Source:
         )
     if family == "command":
         words = tuple(_absolute(word) for word in _split(rest))
-        return Source(family, words, {word: hash_file(Path(word)) for word in words if Path(word).is_file()})
+        return Source(family, words, _files_of(words))
     if family not in FAMILIES:
         entry = registered[family]
         word = _absolute(rest)
-        files = {word: hash_file(Path(word))} if Path(word).is_file() else {}
+        files = _files_of([word])
         version = entry.dist.version if entry.dist is not None else "unknown"
         return Source(family, (word,), files, code=f"{entry.value} {version}")
     path = Path(rest).expanduser()
@@ -120,10 +120,37 @@ def _registered() -> dict[str, importlib.metadata.EntryPoint]:
     return {entry.name: entry for entry in importlib.metadata.entry_points(group=ENTRY_POINTS)}
 
 
+def _path_in(word: str) -> tuple[str, Path | None]:
+    """Return what stands before the path in ``--flag=PATH``, and the path; None when there is none."""
+    flag, equals, value = word.rpartition("=") if word.startswith("-") else ("", "", word)
+    try:
+        path = Path(value).expanduser()
+        is_path = path.is_file() or (path.is_dir() and "/" in value)  # a plain word may be a sub-command
+        return flag + equals, path.absolute() if is_path else None  # not resolved: a venv's python is a link
+    except (OSError, RuntimeError):  # a name that is too long, or of nobody's home
+        return "", None
+
+
 def _absolute(word: str) -> str:
-    """Name a file so that it is found from everywhere; leave other words alone."""
-    path = Path(word).expanduser()
-    return str(path.absolute()) if path.is_file() else word  # not resolved: a venv's python is a link
+    """Name a file or folder so that it is found from everywhere; leave other words alone."""
+    before, path = _path_in(word)
+    return word if path is None else f"{before}{path}"
+
+
+def _files_of(words: Sequence[str]) -> dict[str, str]:
+    """Hash the files that words name.
+
+    Raises:
+        BadInput: a word names a folder, of which nobody can tell what belongs to the policy.
+    """
+    files = {}
+    for word in words:
+        _, path = _path_in(word)
+        if path is not None and path.is_dir():
+            raise BadInput(f"{path} is a folder; name the files that the policy consists of, so that they are hashed")
+        if path is not None:
+            files[str(path)] = hash_file(path)
+    return files
 
 
 def _split(command: str) -> list[str]:
@@ -193,7 +220,8 @@ class ForeignPolicy:
 
     def end(self) -> dict[str, NDArray[Any]]:
         """End the policy's process, if it has one; return ``clipped`` (N,), the number of actions beyond [-1, 1]."""
-        _call(self._act, "end")
+        with self._named("end"):
+            _call(self._act, "end")
         return {"clipped": self._n_clipped}
 
     @property

@@ -138,7 +138,9 @@ def _video(config: VideoArguments) -> list[Followed]:
 def summary(result: Mapping[str, Any]) -> str:
     """One line per sub-goal, as text."""
     lines = [
-        f"  {name:<16} rises at step {one['rises_at']:>3}, highest at {one['highest_at']:>3}"
+        f"  {name:<16} "
+        + ("never rises" if one["rises_at"] is None else f"rises at step {one['rises_at']:>3}")
+        + f", highest at {one['highest_at']:>3}"
         + ("" if one["done_at"] is None else f", done at {one['done_at']:>3}")
         for name, one in result["sub_goals"].items()
     ]

@@ -246,6 +246,8 @@ def _plan_method(recipe: Recipe, method: Mapping[str, Any], goals: Mapping[str, 
     if entry.policy is not None:
         if len(recipe.seeds) > 1 and "{seed}" not in entry.policy:
             raise BadInput(f"{where}: with several seeds the policy must hold {{seed}}, got {entry.policy!r}")
+        if len(recipe.tasks) > 1 and "{task}" not in entry.policy:
+            raise BadInput(f"{where}: with several tasks the policy must hold {{task}}, got {entry.policy!r}")
         training = {"policy": entry.policy, **table_of(flags, where, "dataset", "seed", "run_dir", "name")}
     else:
         training = {"n_updates": 5000, "threads": 1, "device": "cpu"}
