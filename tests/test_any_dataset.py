@@ -26,11 +26,14 @@ from minari.data_collector import EpisodeBuffer
 from PIL import Image
 
 from zest_rl import data
+from zest_rl.data_writer import write_scored
 from zest_rl.embedders import load_embedder
+from zest_rl.errors import ZestError
 from zest_rl.rendering import select_gl_backend
 from zest_rl.scores import score_views
 from zest_rl.sources import open_source
 from zest_rl.sources.pictures import Pictures
+from zest_rl.sources.states import stage_of
 from zest_rl.types import FloatArray, Frame
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari")  # datasets of tests have no author
@@ -334,7 +337,10 @@ def test_episodes_of_one_length_can_be_shuffled(maze: list[Episode], goal: Path,
         (["--goal", "drawings"], "several entries with pictures"),
         (["--frames", "cameras/top", "--goal", "drawings"], "need a goal of their own, got 'drawings'"),
         (["--frames", "cameras/top", "--goal", "text:a -> b"], "reads pictures only; use one that reads text"),
-        (["--frames", "cameras/wrist"], "has no pictures at 'cameras/wrist'; entries with pictures: observations/cam"),
+        (
+            ["--frames", "cameras/wrist"],
+            "has no pictures at 'cameras/wrist', and there is no such folder; entries with pictures: observations/cam",
+        ),
         (["--frames", "cameras/top", "--views", "3"], "--views belong to the kitchen's own renderer"),
     ],
 )
@@ -458,14 +464,64 @@ def test_qpos_is_read_from_observations_where_they_hold_it_to_the_bit(env_id: st
     np.testing.assert_array_equal(frames._recorded(0)["qpos"], [one["qpos"] for one in state])
 
 
-def test_code_of_a_foreign_environment_is_not_run(
+@pytest.mark.parametrize(
+    "trap", ["evil.envs.maze:PointMazeEnv", "zest_rl.cli:main", "gymnasium.envs.registration:make"]
+)
+def test_code_that_is_not_the_registered_environments_is_not_run(
+    trap: str, maze: list[Episode], goal: Path, refusal: Callable[..., tuple[int, str]]
+) -> None:
+    dataset = write_states("maze/random-v0", "PointMaze_UMaze-v3", maze[:1])
+    edit_spec(dataset, entry_point=trap)
+    code, error = refusal("relabel", dataset, "--goal", goal)
+    assert (code, f"would run code of {trap!r}" in error) == (2, True)
+
+
+def edit_spec(dataset: str, **changes: Any) -> None:
+    path = data.dataset_path(dataset) / data.METADATA_FILE
+    metadata = json.loads(path.read_text())
+    metadata["env_spec"] = json.dumps(json.loads(metadata["env_spec"]) | changes)
+    path.write_text(json.dumps(metadata))
+
+
+def test_an_env_spec_that_is_none_is_refused(
     maze: list[Episode], goal: Path, refusal: Callable[..., tuple[int, str]]
 ) -> None:
     dataset = write_states("maze/random-v0", "PointMaze_UMaze-v3", maze[:1])
-    path = data.dataset_path(dataset) / data.METADATA_FILE
-    path.write_text(path.read_text().replace("gymnasium_robotics.envs.maze", "evil.envs.maze"))
+    edit_spec(dataset, unheard_of=1)
     code, error = refusal("relabel", dataset, "--goal", goal)
-    assert (code, "would run code of 'evil.envs.maze" in error) == (2, True)
+    assert (code, "env_spec is not the JSON of a Gymnasium EnvSpec" in error) == (2, True)
+
+
+def test_wrapped_observations_are_not_taken_for_the_state_and_wrappers_are_not_run(
+    maze: list[Episode], goal: Path, refusal: Callable[..., tuple[int, str]]
+) -> None:
+    wrapper = {"name": "Trap", "entry_point": "gymnasium.envs.registration:make", "kwargs": {"id": "CartPole-v1"}}
+    for with_state in (False, True):
+        dataset = write_states(f"maze/state-{with_state}-v0", "PointMaze_UMaze-v3", maze[:1], with_state=with_state)
+        edit_spec(dataset, additional_wrappers=[wrapper])
+    code, error = refusal("relabel", "maze/state-False-v0", "--goal", goal)
+    assert (code, "wrappers (Trap) may have changed the observations of PointMaze_UMaze-v3" in error) == (2, True)
+    assert len(list(open_source("maze/state-True-v0").frames.read(0))) == LENGTHS[0] + 1
+
+
+def test_targets_that_only_a_renderer_places_are_refused(goal: Path, refusal: Callable[..., tuple[int, str]]) -> None:
+    dataset = write_states("hand/random-v0", "HandReach-v3", roll_out("HandReach-v3", (1,)))
+    code, error = refusal("relabel", dataset, "--goal", goal)
+    assert (code, "places targets only while it renders" in error) == (2, True)
+
+
+def test_embeddings_of_states_are_cached_by_the_compiled_model(maze: list[Episode], tmp_path: Path) -> None:
+    bare: Any = gymnasium.make("HalfCheetah-v5").unwrapped
+    text = Path(bare.fullpath).read_text()
+    path, digests = tmp_path / "cheetah.xml", []
+    cheetah = roll_out("HalfCheetah-v5", (1,))
+    dataset = write_states("cheetah/random-v0", "HalfCheetah-v5", cheetah)
+    edit_spec(dataset, kwargs={"xml_file": str(path)})
+    for colour in ("1 0 0 1", "0 1 0 1", "1 0 0 1"):
+        path.write_text(text.replace('rgba="0.8 0.6 .4 1"', f'rgba="{colour}"'))
+        stage_of.cache_clear()
+        digests.append(open_source(dataset).frames.digest(0))
+    assert digests[0] == digests[2] != digests[1]
 
 
 # --- a folder beside the dataset --------------------------------------------------------------------------------------
@@ -582,11 +638,28 @@ def test_a_robomimic_file_without_next_obs_repeats_the_last_frame_and_observatio
         np.testing.assert_array_equal(found.observations["object"][-1], found.observations["object"][-2])
 
 
+def test_the_last_frame_repeats_where_next_obs_lacks_the_camera(maze: list[Episode], tmp_path: Path) -> None:
+    path = write_robomimic(tmp_path / "lift.hdf5", maze)
+    with h5py.File(path, "r+") as file:
+        del file["data/demo_1/next_obs/agentview_image"]
+    frames = open_source(str(path)).frames
+    assert [len(list(frames.read(i))) for i in range(len(maze))] == list(LENGTHS)
+
+
+@pytest.mark.parametrize("dataset", ["/data/missing.hdf5", "~/missing", "./missing", "demos/missing.hdf5"])
+def test_a_path_where_nothing_is_is_named_as_such(
+    dataset: str, goal: Path, refusal: Callable[..., tuple[int, str]]
+) -> None:
+    code, error = refusal("relabel", dataset, "--goal", goal)
+    assert (code, f"there is no file or folder {dataset}" in error) == (2, True)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         (lambda path: path.write_bytes(b"no HDF5"), "cannot be read as HDF5"),
         (lambda path: h5py.File(path, "w").close(), "must hold data/demo_0, … with actions and obs/"),
+        (lambda path: h5py.File(path, "w").create_group("data/demo_x").file.close(), "named data/demo_0, data/demo_1"),
         (lambda path: path.mkdir(), "is a folder, but no LeRobot dataset"),
     ],
 )
@@ -613,6 +686,7 @@ def write_lerobot(root: Path, maze: list[Episode], *, version: str = "v3.0") -> 
                 "action": episode.actions.tolist(),
                 "next.reward": (episode.rewards + i).astype(np.float32).tolist(),
                 "next.done": (np.arange(n_steps) == n_steps - 1).tolist(),
+                "next.truncated": [False] * n_steps,
                 "timestamp": (np.arange(n_steps) / fps).astype(np.float32).tolist(),
                 "frame_index": list(range(n_steps)),
                 "episode_index": [i] * n_steps,
@@ -657,6 +731,7 @@ def write_lerobot(root: Path, maze: list[Episode], *, version: str = "v3.0") -> 
         "action": {**number, "shape": [2]},
         "next.reward": {**number, "shape": [1]},
         "next.done": {"dtype": "bool", "shape": [1]},
+        "next.truncated": {"dtype": "bool", "shape": [1]},
         "episode_index": {"dtype": "int64", "shape": [1]},
     }
     info = {
@@ -699,6 +774,97 @@ def test_an_older_lerobot_dataset_is_refused_with_what_converts_it(
 ) -> None:
     code, error = refusal("relabel", write_lerobot(tmp_path / "old", maze, version="v2.1"), "--goal", goal)
     assert (code, "of version v2.1, v3.0 is read; convert it with" in error) == (2, True)
+
+
+@pytest.mark.parametrize("lost", ["features", "fps"])
+def test_a_lerobot_folder_whose_info_lacks_a_part_is_refused(
+    lost: str, maze: list[Episode], goal: Path, refusal: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    path = write_lerobot(tmp_path / "pusht", maze) / "meta" / "info.json"
+    path.write_text(json.dumps({name: value for name, value in json.loads(path.read_text()).items() if name != lost}))
+    code, error = refusal("relabel", tmp_path / "pusht", "--goal", goal)
+    assert (code, f"is not that of a LeRobot v3.0 dataset ({lost!r})" in error) == (2, True)
+
+
+def test_without_next_truncated_an_episode_of_lerobot_counts_as_cut(maze: list[Episode], tmp_path: Path) -> None:
+    root = write_lerobot(tmp_path / "pusht", maze)
+    rows_: Any = open_source(str(root)).trajectories
+    assert [episode.terminated for episode in rows_.episodes()] == [True] * 3
+    path = root / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    del info["features"]["next.truncated"]
+    path.write_text(json.dumps(info))
+    rows_ = open_source(str(root)).trajectories
+    assert [episode.terminated for episode in rows_.episodes()] == [False] * 3
+
+
+@pytest.mark.parametrize("form", ["robomimic", "lerobot"])
+def test_ends_are_those_of_the_dataset_that_was_exported(
+    form: str, maze: list[Episode], goal: Path, zest: Run, tmp_path: Path
+) -> None:
+    dataset = blind(maze)
+    with h5py.File(data.dataset_path(dataset) / data.DATA_FILE, "r+") as file:
+        file["episode_1/terminations"][-1], file["episode_1/truncations"][-1] = True, False
+    for i, episode in enumerate(maze):
+        for t, frame in enumerate(episode.frames):
+            path = tmp_path / "films" / f"episode_{i}" / f"{t}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(frame).save(path)
+    exported = zest("export", dataset, "--to", form, "--output", tmp_path / "exported.hdf5")["file"]
+    made = zest("relabel", exported, "--goal", goal, "--frames", tmp_path / "films", "--n-workers", "1")["dataset"]
+    assert [episode.terminated for episode in data.read_episodes(made)] == [False, True, False]
+
+
+# --- what is kept and checked -----------------------------------------------------------------------------------------
+
+
+def test_datasets_that_differ_by_their_rewards_alone_are_not_taken_for_one_another(
+    maze: list[Episode], goal: Path, zest: Run, tmp_path: Path
+) -> None:
+    made = []
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        path = write_robomimic(tmp_path / folder / "lift.hdf5", maze)
+        with h5py.File(path, "r+") as file:
+            file["data/demo_1/rewards"][:] = 7 if folder == "b" else np.nan
+        made.append(zest("relabel", path, "--goal", goal, "--n-workers", "1")["dataset"])
+    assert made[0] != made[1]
+    found = [arrays(name) for name in made]
+    assert "episode_1/infos/source/reward" not in found[0], "none were recorded"
+    np.testing.assert_array_equal(found[1]["episode_1/infos/source/reward"], [0, *[7] * LENGTHS[1]])
+
+
+def test_a_reward_that_is_nan_does_not_lose_the_others_and_an_info_called_gt_is_no_ground_truth(
+    maze: list[Episode], goal: Path, zest: Run
+) -> None:
+    dataset = write_minari(
+        "maze/nan-v0",
+        maze,
+        with_pictures,
+        space_of(with_pictures(maze[0])),
+        infos=lambda episode: {"gt": {"depth": np.zeros(len(episode.frames))}},
+        jpeg_encoding=False,
+    )
+    with h5py.File(data.dataset_path(dataset) / data.DATA_FILE, "r+") as file:
+        file["episode_0/rewards"][1] = np.nan
+    made = zest("relabel", dataset, "--goal", goal, "--frames", "cameras/top", "--n-workers", "1")["dataset"]
+    check_kept_but_the_rewards(dataset, made)
+
+
+@pytest.mark.parametrize("name", ["observations/object", "infos/source/reward"])
+def test_imported_arrays_that_did_not_reach_the_disk_are_noticed(
+    name: str, maze: list[Episode], tmp_path: Path
+) -> None:
+    def lose(staging: Path) -> None:
+        with h5py.File(staging / data.DATA_FILE, "r+") as file:
+            file[f"episode_1/{name}"][-1] += 1
+
+    demos = open_source(str(write_robomimic(tmp_path / "lift.hdf5", maze))).trajectories
+    scores = [np.zeros(length + 1, np.float32) for length in LENGTHS]
+    rewards = [score[1:] for score in scores]
+    with pytest.raises(ZestError, match=f"{name} of episode 1 of zest/lift-v0 was not written whole"):
+        write_scored(demos, "zest/lift-v0", rewards, scores, description="", zest={}, extra=lose)
+    assert data.list_datasets() == []
 
 
 # --- what comes after -------------------------------------------------------------------------------------------------

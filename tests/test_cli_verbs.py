@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from conftest import COLLECTED
+from PIL import Image
 
 from zest_rl import artifacts, data
 from zest_rl.cli import collect as collect_verb
@@ -88,6 +89,25 @@ def test_a_rerun_of_a_finished_verb_changes_nothing(
     assert [path.stat().st_mtime_ns for path in kept] == written
     assert second[0] == first[0]
     assert {**second[1], "seconds": 0} == {**first[1], "seconds": 0}
+
+
+def test_a_policy_on_the_kitchen_relabeled_by_other_frames_is_evaluated_but_not_scored_online(
+    collected: str, zest: Callable[..., dict[str, Any]], refusal: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    for part, colour in (("init", "black"), ("goal", "white")):
+        (tmp_path / part).mkdir()
+        Image.new("RGB", (16, 16), colour).save(tmp_path / part / "0.png")
+    for i, episode in enumerate(data.read_episodes(collected)):
+        (tmp_path / "films" / f"episode_{i}").mkdir(parents=True)
+        for t in range(len(episode) + 1):
+            Image.new("L", (8, 8), t).save(tmp_path / "films" / f"episode_{i}" / f"{t}.png")
+    words = ("--goal", tmp_path, "--frames", tmp_path / "films", "--n-workers", "1")
+    made = zest("relabel", collected, *words)["dataset"]
+    run = tmp_path / "run"
+    assert zest("train", "bc", made, *SMALL, "--run-dir", run)["next"] == f"zest evaluate {shlex.quote(str(run))}"
+    code, message = refusal("evaluate", run, "--score")
+    assert (code, "its frames are from elsewhere, so scores cannot be made online" in message) == (2, True)
+    zest("evaluate", run, "--n-episodes", "1", "--n-workers", "1", "--no-videos")
 
 
 def test_what_cannot_be_done_has_an_exit_code_and_says_what_to_do(

@@ -129,7 +129,8 @@ def test_numbers_of_a_dictionary_are_flattened_as_gymnasium_flattens_them(group:
     group["goal/wanted"] = [sample["goal"]["wanted"] for sample in samples]
     group["goal/achieved"] = [sample["goal"]["achieved"] for sample in samples]
     group["camera"] = np.stack([picture(i) for i in range(6)])
-    group["words"] = [b"a sentence"] * 6
+    group.create_dataset("words", data=["a sentence", "", *"word"], dtype=h5py.string_dtype())
     assert list(entries(group)) == ["camera", "goal/achieved", "goal/wanted", "observation", "words"]
     expected = np.stack([spaces.flatten(space, sample) for sample in samples]).astype(np.float32)
     np.testing.assert_array_equal(numbers(group), expected)
+    assert [bytes(row) for row in stored_rows(group["words"])] == [b"a sentence", b"", b"w", b"o", b"r", b"d"]

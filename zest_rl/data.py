@@ -40,6 +40,7 @@ TRUSTED_ENTRY_POINTS = ("gymnasium.", "gymnasium_robotics.", "zest_rl.")
 DATA_FILE, METADATA_FILE, MANIFEST_FILE = "data/main_data.hdf5", "data/metadata.json", "zest_manifest.json"
 SOURCE_REWARD = "infos/source/reward"
 """Where the rewards of another environment's dataset are kept when it is relabeled."""
+_GT_REWARD = "infos/gt/reward"
 
 
 def datasets_root() -> Path:
@@ -229,7 +230,7 @@ def read_states(dataset_id: str) -> list[NDArray[np.float64]]:
 
 def has_ground_truth(dataset_id: str) -> bool:
     """Whether any episode holds the hand-designed rewards; `read_ground_truth` refuses a dataset where some do not."""
-    return any(_each(dataset_id, lambda group: "infos/gt" in group))
+    return any(_each(dataset_id, lambda group: _GT_REWARD in group))
 
 
 def read_ground_truth(dataset_id: str) -> list[GroundTruth]:
@@ -241,7 +242,7 @@ def read_ground_truth(dataset_id: str) -> list[GroundTruth]:
 
     def read(group: h5py.Group) -> GroundTruth:
         return GroundTruth(
-            rewards=_array(group, "infos/gt/reward", np.float32, dataset_id)[1:],
+            rewards=_array(group, _GT_REWARD, np.float32, dataset_id)[1:],
             success=bool(_array(group, "infos/gt/success", bool, dataset_id).any()),
         )
 
@@ -264,6 +265,19 @@ def read_source_rewards(dataset_id: str) -> list[FloatArray] | None:
         lambda group: _array(group, SOURCE_REWARD, np.float32, dataset_id)[1:] if SOURCE_REWARD in group else None,
     )
     return None if any(rewards is None for rewards in found) else found
+
+
+def rewards_to_keep(dataset_id: str) -> list[FloatArray | None]:
+    """Read the rewards (T,) of every episode that a relabeled copy keeps as its source's; None: the ground truth is."""
+
+    def read(group: h5py.Group) -> FloatArray | None:
+        if _GT_REWARD in group:
+            return None
+        if SOURCE_REWARD in group:
+            return _array(group, SOURCE_REWARD, np.float32, dataset_id)[1:]
+        return _array(group, "rewards", np.float32, dataset_id)
+
+    return _each(dataset_id, read)
 
 
 def fingerprint(dataset_id: str) -> str:

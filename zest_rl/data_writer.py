@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -31,6 +31,7 @@ from zest_rl.data import (
     fingerprint,
     read_metadata,
     read_rewards,
+    rewards_to_keep,
 )
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.parallel import die_with_parent, starting_children
@@ -98,19 +99,21 @@ def _set_metadata(path: Path, **values: object) -> None:
     artifacts.write_json(path, metadata)
 
 
-def _publish(staging: Path, dataset_id: str, meant: Sequence[Mapping[str, NDArray[Any]]]) -> None:
+def _publish(staging: Path, dataset_id: str, meant: Iterable[Mapping[str, NDArray[Any]]]) -> None:
     """Compare a staged dataset with the arrays that were meant to be written, and write its manifest.
 
     h5py drops the error of a write that fails while an array is closed, so only reading shows that all is there.
     """
+    n_meant = 0
     with h5py.File(staging / DATA_FILE, "r") as file:
         for i, arrays in enumerate(meant):
+            n_meant += 1
             for name, array in arrays.items():
                 stored = file.get(f"episode_{i}/{name}")
-                if stored is None or not np.array_equal(stored[()], array):
+                if stored is None or not np.array_equal(stored[()], array, equal_nan=True):
                     raise ZestError(f"{name} of episode {i} of {dataset_id} was not written whole; is the disk full?")
-        if len(file) != len(meant):
-            raise ZestError(f"{len(file)} of {len(meant)} episodes of {dataset_id} were written; try again")
+        if len(file) != n_meant:
+            raise ZestError(f"{len(file)} of {n_meant} episodes of {dataset_id} were written; try again")
     files = [path for path in sorted(staging.rglob("*")) if path.is_file()]
     digests = {path.relative_to(staging).as_posix(): artifacts.hash_file(path) for path in files}
     artifacts.write_json(staging / MANIFEST_FILE, digests)
@@ -234,11 +237,17 @@ class Trajectories(Protocol):
     def fingerprint(self) -> str:
         """64 hex digits over all that training may see of them, but no rewards."""
 
+    def source_rewards(self) -> Sequence[FloatArray | None]:
+        """Rewards (T,) of every episode to keep beside the new ones; None, or all NaN: there are none to keep."""
+
     def fill(self, folder: Path) -> None:
         """Leave a Minari dataset's `DATA_FILE` and `METADATA_FILE` in `folder`, never all episodes in memory.
 
         Runs in a process of its own. Rewards that are not there to begin with are NaN.
         """
+
+    def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
+        """Yield for every episode the arrays that `fill` must have left, by their names on disk."""
 
 
 @dataclass(frozen=True)
@@ -261,33 +270,40 @@ class Copied:
         """See `zest_rl.data.fingerprint`."""
         return fingerprint(self.dataset_id)
 
+    def source_rewards(self) -> Sequence[FloatArray | None]:
+        """See `zest_rl.data.rewards_to_keep`."""
+        return rewards_to_keep(self.dataset_id)
+
     def fill(self, folder: Path) -> None:
         """Copy the two files."""
         (folder / "data").mkdir()
         for name in (DATA_FILE, METADATA_FILE):
             shutil.copyfile(dataset_path(self.dataset_id) / name, folder / name)
 
-
-def _rewrite_rewards(path: Path, rewards: Sequence[FloatArray], scores: Sequence[FloatArray]) -> None:
-    with h5py.File(path, "r+") as file:
-        for i, (reward, score) in enumerate(zip(rewards, scores, strict=True)):
-            group = file[f"episode_{i}"]
-            before = np.asarray(group["rewards"][()], np.float32)
-            del group["rewards"]
-            group["rewards"] = reward
-            infos = group.require_group("infos")
-            if not ("infos/gt" in group or SOURCE_REWARD in group or np.isnan(before).any()):
-                group[SOURCE_REWARD] = np.concatenate([np.zeros(1, np.float32), before])
-            if "zest" in infos:
-                del infos["zest"]
-            infos["zest/score"] = score
+    def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
+        """Nothing: a copy of a file that fails raises."""
+        return ({} for _ in self.n_steps)
 
 
-def _build_scored(
-    trajectories: Trajectories, folder: Path, rewards: Sequence[FloatArray], scores: Sequence[FloatArray]
-) -> None:
+def _build_scored(trajectories: Trajectories, folder: Path, scored: Sequence[Mapping[str, FloatArray]]) -> None:
     trajectories.fill(folder)
-    _rewrite_rewards(folder / DATA_FILE, rewards, scores)
+    with h5py.File(folder / DATA_FILE, "r+") as file:
+        for i, arrays in enumerate(scored):
+            group = file[f"episode_{i}"]
+            if "infos/zest" in group:
+                del group["infos/zest"]
+            for name, array in arrays.items():
+                if name in group:
+                    del group[name]
+                group[name] = array
+
+
+def _scored(reward: FloatArray, score: FloatArray, source: FloatArray | None) -> dict[str, FloatArray]:
+    """Return what is new in an episode, under the names on disk."""
+    arrays = {"rewards": reward, "infos/zest/score": score}
+    if source is not None and not np.isnan(source).all():
+        arrays[SOURCE_REWARD] = np.concatenate([np.zeros(1, np.float32), source])
+    return arrays
 
 
 def write_relabeled(
@@ -345,7 +361,8 @@ def write_scored(
             raise BadInput(f"dataset {dataset_id} exists already; choose another name or delete {final}")
         artifacts.check_free_space(final.parent, 2 * trajectories.n_bytes)
         with artifacts.staged_folder(final) as staging:
-            _in_child(_build_scored, trajectories, staging, rewards, scores)
+            scored = [_scored(*new) for new in zip(rewards, scores, trajectories.source_rewards(), strict=True)]
+            _in_child(_build_scored, trajectories, staging, scored)
             metadata = artifacts.read_json(staging / METADATA_FILE)
             _set_metadata(
                 staging / METADATA_FILE,
@@ -354,9 +371,6 @@ def write_scored(
                 zest={**metadata.get("zest", {}), **zest},
             )
             extra(staging)
-            _publish(
-                staging,
-                dataset_id,
-                [{"rewards": r, "infos/zest/score": s} for r, s in zip(rewards, scores, strict=True)],
-            )
+            meant = ({**old, **new} for old, new in zip(trajectories.written(), scored, strict=True))
+            _publish(staging, dataset_id, meant)
     return final

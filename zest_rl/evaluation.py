@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from zest_rl import artifacts, data
 from zest_rl.agents import Policy, load_policy
 from zest_rl.data import check_env_spec
-from zest_rl.envs import ENV_ID
+from zest_rl.envs import ENV_ID, check_registered
 from zest_rl.errors import BadInput, nearest
 from zest_rl.metrics import bootstrap, iqm, normalized_return, wilson
 from zest_rl.parallel import chunks, map_jobs, one_thread, read_parts
@@ -200,7 +200,13 @@ def _kitchen_spec(env_spec: str) -> gymnasium.envs.registration.EnvSpec:
             f"evaluation needs {ENV_ID} with a horizon, got {spec.id} with max_episode_steps {spec.max_episode_steps}; "
             "train on a dataset of `zest collect`"
         )
+    check_registered(spec)
     return spec
+
+
+def is_evaluable(dataset: Mapping[str, Any]) -> bool:
+    """Whether the `zest_rl.data.describe` of a run's dataset is of the environment that `evaluate` runs."""
+    return not data.is_foreign(dataset) or json.loads(dataset["env_spec"] or "{}").get("id") == ENV_ID
 
 
 def _decrement(
@@ -260,7 +266,7 @@ def evaluate(
     run = run.resolve()
     policy = load_policy(run, device=device)
     dataset = policy.meta["dataset"]
-    if data.is_foreign(dataset) and json.loads(dataset["env_spec"] or "{}").get("id") != ENV_ID:
+    if not is_evaluable(dataset):
         dataset_id = dataset["id"]
         raise BadInput(
             f"`zest evaluate` runs {ENV_ID} alone, and {run.name} was trained on {dataset_id}; act with it from Python "
@@ -268,10 +274,12 @@ def evaluate(
         )
     scored = score or uses_online_scores(policy, config)
     if scored and not (run / SCORER_FILE).exists():
-        raise BadInput(
-            f"scores are needed, but {run.name} has no {SCORER_FILE}: it was not trained on a relabeled dataset; "
-            "use --rtg constant, or train on the output of `zest relabel`"
+        reason = (
+            "its frames are from elsewhere, so scores cannot be made online; use --rtg constant"
+            if data.is_foreign(dataset)
+            else "it was not trained on a relabeled dataset; use --rtg constant, or train on what `zest relabel` writes"
         )
+        raise BadInput(f"scores are needed, but {run.name} has no {SCORER_FILE}: {reason}")
     folder = evaluation_folder(run, config)
     jobs = {}
     for part in chunks(config.n_episodes, max(EPISODES_PER_JOB, config.n_episodes // N_JOBS)):

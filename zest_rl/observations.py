@@ -115,7 +115,9 @@ def choose_pictures(found: dict[str, int | None], wanted: Iterable[str], where: 
     for key in wanted:
         name = next((name for name, full in shown.items() if key in (name, full)), None)
         if name is None:
-            raise BadInput(f"{where} has no pictures at {key!r}; entries with pictures: {listing}")
+            raise BadInput(
+                f"{where} has no pictures at {key!r}, and there is no such folder; entries with pictures: {listing}"
+            )
         chosen.append(name)
     if chosen:
         return chosen
@@ -131,9 +133,10 @@ def choose_pictures(found: dict[str, int | None], wanted: Iterable[str], where: 
 
 
 def stored_rows(entry: h5py.Dataset) -> Iterator[NDArray[Any]]:
-    """Yield what an entry holds as it is stored, `ROWS` steps at a time."""
+    """Yield what an entry holds as it is stored, `ROWS` steps at a time; text as the bytes of each row."""
     if h5py.check_vlen_dtype(entry.dtype) is not None:
-        yield from (entry[row] for row in range(len(entry)))
+        for row in range(len(entry)):
+            yield np.frombuffer(entry[row], np.uint8) if isinstance(entry[row], bytes) else entry[row]
     else:
         yield from (entry[row : row + ROWS] for row in range(0, len(entry), ROWS))
 
@@ -142,7 +145,7 @@ def numbers(node: h5py.Group | h5py.Dataset) -> FloatArray:
     """Flatten the numbers of an observation: one row per step.
 
     The entries of a Dict follow each other in the alphabetical order of their paths, as Gymnasium's ``flatten`` has
-    them; pictures and text are left out.
+    them; pictures and text are left out, and a Discrete stays one number.
 
     Returns:
         (T+1, n) float32.

@@ -60,7 +60,8 @@ def relabel_frames(
     scorer = FrameScorer(config, device=device, n_workers=n_workers)
     digests = [source.frames.digest(episode) for episode in range(len(trajectories.n_steps))]
     fingerprint = trajectories.fingerprint()
-    digest = artifacts.hash_json([fingerprint, digests, scorer.fingerprint(), reward, shuffle])
+    kept = [None if r is None else artifacts.hash_arrays(r) for r in trajectories.source_rewards()]
+    digest = artifacts.hash_json([fingerprint, kept, digests, scorer.fingerprint(), reward, shuffle])
     target_id = relabeled_id(trajectories.dataset_id, digest)
     path = data.dataset_path(target_id)
     n_frames = sum(trajectories.n_steps) + len(trajectories.n_steps)
@@ -70,7 +71,7 @@ def relabel_frames(
         if data.exists(target_id):  # an equal call that ran at the same time
             return RelabeledFrames(target_id, path, n_frames, 0, None, already_there=True)
         scorer.embed(source, digests, on_progress)
-        kept = scorer.select_goals(source, digests) if config.goal_share < 1 else None
+        kept_goals = scorer.select_goals(source, digests) if config.goal_share < 1 else None
         scores, n_still = scorer.score_episodes(source, digests)
         if shuffle is not None:
             scores = shuffled(scores, shuffle)
@@ -88,7 +89,7 @@ def relabel_frames(
                     "frames_sha256": artifacts.hash_json(digests),
                     "reward": reward,
                     "shuffle": shuffle,
-                    "kept_goals": None if kept is None else kept.tolist(),
+                    "kept_goals": None if kept_goals is None else kept_goals.tolist(),
                     "scorer": scorer.describe(),
                     "n_still_frames": n_still,
                     "provenance": artifacts.provenance(),

@@ -54,7 +54,7 @@ def _with_arguments(agent: str, config: type[Any]) -> type[Any]:
 def run(config: Arguments, ui: Ui) -> dict[str, Any]:
     """Train, or go on training."""
     from zest_rl.agents import AGENTS
-    from zest_rl.data import is_foreign
+    from zest_rl.evaluation import is_evaluable
 
     agent_class = AGENTS[config.agent].config
     agent_config = agent_class(**{field.name: getattr(config, field.name) for field in fields(agent_class)})
@@ -68,7 +68,7 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
         "n_params": meta["n_params"],
         "n_updates": meta["n_updates"],
         "train_seconds": meta["train_seconds"],
-        "next": f"zest export {config.dataset}" if is_foreign(meta["dataset"]) else f"zest evaluate {quoted}",
+        "next": f"zest evaluate {quoted}" if is_evaluable(meta["dataset"]) else f"zest export {config.dataset}",
     }
 
 

@@ -31,8 +31,12 @@ def is_kitchen(dataset: str) -> bool:
 
 
 def _is_path(dataset: str) -> bool:
-    path = Path(dataset).expanduser()
-    return path.exists() and not (data.DATASET_ID.fullmatch(dataset) and data.exists(dataset))
+    path, is_id = Path(dataset).expanduser(), data.DATASET_ID.fullmatch(dataset)
+    if not (path.exists() or is_id) and (path.suffix or dataset.startswith(("/", ".", "~"))):
+        raise BadInput(
+            f"there is no file or folder {dataset}; give a robomimic HDF5 file, a LeRobot folder or a Minari id"
+        )
+    return path.exists() and not (is_id and data.exists(dataset))
 
 
 def open_source(dataset: str, *, frames: Sequence[str] = (), cameras: Sequence[str] = ()) -> Source:

@@ -63,6 +63,17 @@ def fingerprint(episodes: Iterable[Imported]) -> str:
     )
 
 
+def stored(episode: Imported) -> dict[str, NDArray[Any]]:
+    """Return what `fill` writes of an episode but its rewards, under the names on disk."""
+    last = np.arange(len(episode.actions)) == len(episode.actions) - 1
+    return {
+        **{f"observations/{name}": values for name, values in episode.obs.items()},
+        "actions": episode.actions,
+        "terminations": last & episode.terminated,
+        "truncations": last & (not episode.terminated),
+    }
+
+
 def fill(folder: Path, dataset_id: str, episodes: Iterable[Imported], description: str) -> None:
     """Write the files of a Minari dataset; see `zest_rl.data_writer.Trajectories`."""
     import minari
@@ -80,7 +91,7 @@ def fill(folder: Path, dataset_id: str, episodes: Iterable[Imported], descriptio
             storage = MinariStorage.new(
                 folder / "data", observation_space=observation_space, action_space=space(episode.actions)
             )
-        last = np.arange(len(episode.actions)) == len(episode.actions) - 1
+        arrays = stored(episode)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             storage.update_episodes(
@@ -90,8 +101,8 @@ def fill(folder: Path, dataset_id: str, episodes: Iterable[Imported], descriptio
                         observations=episode.obs,
                         actions=episode.actions,
                         rewards=episode.rewards,
-                        terminations=last & episode.terminated,
-                        truncations=last & (not episode.terminated),
+                        terminations=arrays["terminations"],
+                        truncations=arrays["truncations"],
                     )
                 ]
             )

@@ -8,8 +8,9 @@ Layout: https://huggingface.co/docs/lerobot/lerobot-dataset-v3, read without the
     data/chunk-000/file-000.parquet                 a row per frame: episode_index, observation.*, action, next.reward …
     videos/KEY/chunk-000/file-000.mp4               one camera
 
-An episode has T rows and T frames, o_0 … o_{T-1}; o_T, which is not recorded, repeats o_{T-1}. An episode counts as
-terminated when its last ``next.done`` is true, and else as cut by the horizon.
+An episode has T rows and T frames, o_0 … o_{T-1}; o_T, which is not recorded, repeats o_{T-1}. LeRobot's ``next.done``
+marks the last frame whatever ended the episode, so an episode counts as terminated when its last ``next.done`` is true
+and its last ``next.truncated`` false; where either is not recorded, as cut by a time limit.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
+from numpy.typing import NDArray
 
 from zest_rl import artifacts
 from zest_rl.errors import BadInput
@@ -47,7 +49,7 @@ class Rows:
     observed: tuple[str, ...]
     """Columns with numbers that are observed."""
     others: tuple[str, ...]
-    """Those of action, next.reward and next.done that there are."""
+    """Those of action, next.reward, next.done and next.truncated that there are."""
 
     @property
     def dataset_id(self) -> str:
@@ -63,9 +65,17 @@ class Rows:
         """Hash observations, actions and ends."""
         return imported.fingerprint(self.episodes())
 
+    def source_rewards(self) -> Sequence[FloatArray | None]:
+        """Read the rewards that the episodes came with."""
+        return [episode.rewards for episode in self.episodes()]
+
     def fill(self, folder: Path) -> None:
         """Write them as a Minari dataset."""
         imported.fill(folder, self.dataset_id, self.episodes(), f"Imported from {self.root.name} (LeRobot).")
+
+    def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
+        """Yield what is written of each episode."""
+        return map(imported.stored, self.episodes())
 
     def episodes(self) -> Iterator[Imported]:
         """Read one file at a time, which LeRobot keeps at 100 MB."""
@@ -88,7 +98,9 @@ class Rows:
         obs = {name: np.concatenate([columns[name], columns[name][-1:]]) for name in self.observed}
         n_steps = len(columns["action"])
         rewards = columns.get("next.reward", np.full((n_steps, 1), np.nan, np.float32))[:, 0]
-        return Imported(obs, columns["action"], rewards, bool("next.done" in columns and columns["next.done"][-1, 0]))
+        done, truncated = (columns.get(f"next.{end}") for end in ("done", "truncated"))
+        terminated = done is not None and truncated is not None and bool(done[-1, 0] and not truncated[-1, 0])
+        return Imported(obs, columns["action"], rewards, terminated)
 
 
 def _column(values: Any) -> FloatArray:
@@ -182,17 +194,18 @@ def open_lerobot(root: Path, keys: Sequence[str], *, with_frames: bool = True) -
         import pyarrow.parquet
     except ImportError as error:
         raise BadInput("LeRobot's parquet files need pyarrow: pip install 'zest-rl[lerobot]'") from error
-    root, features = root.resolve(), info["features"]
-    videos = {name: 3 if f["dtype"] == "video" and not _is_depth(f) else None for name, f in features.items()}
-    views = choose_pictures(videos, keys, str(root)) if with_frames and (keys or any(videos.values())) else []
-    observed = tuple(
-        name
-        for name, facts in features.items()
-        if name.startswith("observation") and facts["dtype"] in _NUMBERS and len(facts["shape"]) <= 1
-    )
-    places = [f"videos/{view}/{part}" for view in views for part in ("chunk_index", "file_index", "from_timestamp")]
-    columns = ["episode_index", "length", "data/chunk_index", "data/file_index", *places]
+    root = root.resolve()
     try:
+        features, fps = info["features"], float(info["fps"])
+        videos = {name: 3 if f["dtype"] == "video" and not _is_depth(f) else None for name, f in features.items()}
+        views = choose_pictures(videos, keys, str(root)) if with_frames and (keys or any(videos.values())) else []
+        observed = tuple(
+            name
+            for name, facts in features.items()
+            if name.startswith("observation") and facts["dtype"] in _NUMBERS and len(facts["shape"]) <= 1
+        )
+        places = [f"videos/{view}/{part}" for view in views for part in ("chunk_index", "file_index", "from_timestamp")]
+        columns = ["episode_index", "length", "data/chunk_index", "data/file_index", *places]
         parts = [pyarrow.parquet.read_table(p, columns=columns) for p in sorted(root.glob("meta/episodes/*/*.parquet"))]
         episodes = sorted((row for part in parts for row in part.to_pylist()), key=lambda row: row["episode_index"])
         n_steps = tuple(int(row["length"]) for row in episodes)
@@ -217,11 +230,11 @@ def open_lerobot(root: Path, keys: Sequence[str], *, with_frames: bool = True) -
     missing = sorted(path.relative_to(root).as_posix() for path in needed if not path.is_file())
     if missing:
         raise BadInput(f"{root} lacks {missing[0]} ({len(missing)} files in all); download the dataset whole")
-    others = tuple(name for name in ("action", "next.reward", "next.done") if name in features)
+    others = tuple(name for name in ("action", "next.reward", "next.done", "next.truncated") if name in features)
     if "action" not in others:
         raise BadInput(f"{root} has no feature 'action', got {', '.join(features)}")
     rows_ = Rows(root, files, n_steps, observed, others)
-    return rows_, Videos(tuple(views), float(info["fps"]), spans) if views else None
+    return rows_, Videos(tuple(views), fps, spans) if views else None
 
 
 def _path(template: str, row: Mapping[str, Any], where: str, video_key: str = "") -> str:

@@ -2,17 +2,19 @@
 
 Layout: https://robomimic.github.io/docs/datasets/overview.html. obs/KEY has T rows, o_0 … o_{T-1}; o_T is the
 last row of next_obs/KEY, and where there is no next_obs it repeats o_{T-1}. An episode counts as terminated when its
-last ``dones`` is 1, and else as cut by the horizon.
+last ``terminals`` is 1, which `zest export` records; without it, its last ``dones``; and else as cut by the horizon.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from zest_rl.errors import BadInput
 from zest_rl.observations import choose_pictures, entries, n_channels
@@ -43,9 +45,17 @@ class Demos:
         """Hash observations, actions and ends."""
         return imported.fingerprint(self.episodes())
 
+    def source_rewards(self) -> Sequence[FloatArray | None]:
+        """Read the rewards that the episodes came with."""
+        return [episode.rewards for episode in self.episodes()]
+
     def fill(self, folder: Path) -> None:
         """Write them as a Minari dataset."""
         imported.fill(folder, self.dataset_id, self.episodes(), f"Imported from {self.file.name} (robomimic).")
+
+    def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
+        """Yield what is written of each episode."""
+        return map(imported.stored, self.episodes())
 
     def episodes(self) -> Iterator[Imported]:
         """Read one episode at a time."""
@@ -64,7 +74,7 @@ def _read(demo: h5py.Group) -> Imported:
             after = demo.get(f"next_obs/{path}")
             last = rows[-1:] if after is None else np.asarray(after[-1:], np.float32).reshape(1, -1)
             obs[path.replace("/", ".")] = np.concatenate([rows, last])
-    ends = np.asarray(demo["dones"][()]) if "dones" in demo else np.zeros(1)
+    ends = next((np.asarray(demo[name][()]) for name in ("terminals", "dones") if name in demo), np.zeros(1))
     try:
         return Imported(obs, actions, rewards, bool(len(ends) and ends[-1]))
     except BadInput as error:
@@ -89,6 +99,9 @@ def open_robomimic(path: Path, keys: Sequence[str], *, with_frames: bool = True)
         with h5py.File(path, "r") as file:
             demos = file.get("data")
             found = [name for name in demos if name.startswith("demo_")] if isinstance(demos, h5py.Group) else []
+            odd = [name for name in found if not name.removeprefix("demo_").isdecimal()]
+            if odd:
+                raise BadInput(f"episodes must be named data/demo_0, data/demo_1, …, got data/{odd[0]} in {path}")
             names = [f"data/{name}" for name in sorted(found, key=lambda name: int(name.removeprefix("demo_")))]
             lacking = [name for name in names if "actions" not in file[name] or "obs" not in file[name]]
             if not names or lacking:
@@ -97,7 +110,6 @@ def open_robomimic(path: Path, keys: Sequence[str], *, with_frames: bool = True)
                     + (f"{lacking[0]} lacks one of them (extract observations first)" if lacking else "it has none")
                 )
             n_steps = tuple(len(file[name]["actions"]) for name in names)
-            has_last = all("next_obs" in file[name] for name in names)
             numbers = [e for e in entries(file[names[0]]["obs"]).values() if n_channels(e) is None]
             n_bytes = 4 * sum(n_steps) * (32 + sum(int(np.prod(e.shape[1:])) for e in numbers))
     except OSError as error:
@@ -107,5 +119,8 @@ def open_robomimic(path: Path, keys: Sequence[str], *, with_frames: bool = True)
     if not with_frames or not (keys or any(pictures.values())):
         return demos_, None
     chosen = choose_pictures(pictures, keys, str(path), "obs")
-    after = tuple(f"next_obs/{key}" for key in chosen) if has_last else ()
-    return demos_, Pictures(path.resolve(), tuple(names), tuple(f"obs/{key}" for key in chosen), after)
+    after = tuple(f"next_obs/{key}" for key in chosen)
+    with h5py.File(path, "r") as file:
+        has_last = all(key in file[name] for key in after for name in names)
+    views = tuple(f"obs/{key}" for key in chosen)
+    return demos_, Pictures(path.resolve(), tuple(names), views, after if has_last else ())

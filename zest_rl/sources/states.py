@@ -2,7 +2,8 @@
 
 A frame is drawn as `zest_rl.rendering` draws the kitchen: no shadows, reflections, multisampling or sky. It shows the
 state exactly where all that moves is in qpos, or is known to `SCENERY`: targets and furniture that an environment puts
-elsewhere in each episode. Environments are made of the allow-listed packages alone (`zest_rl.data.check_env_spec`).
+elsewhere in each episode. Only registered environments of the allow-listed packages are made, without their wrappers
+(`zest_rl.data.check_env_spec`, `zest_rl.envs.check_registered`).
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl import artifacts
+from zest_rl.envs import check_registered
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.observations import entries
 from zest_rl.rendering import Canvas
@@ -85,10 +87,11 @@ class States:
         }
 
     def digest(self, episode: int) -> str:
-        """Hash the states, the environment with its versions, and the cameras."""
+        """Hash the states, the environment with its versions and its model, and the cameras."""
         versions = [importlib.metadata.version(name) for name in ("mujoco", "gymnasium", "gymnasium-robotics")]
         recorded = self._recorded(episode)
-        how = [self.env_spec, versions, self.cameras, SIZE, _VERSION, sorted(recorded)]
+        model = stage_of(self.env_spec, self.cameras).model_sha256
+        how = [self.env_spec, versions, model, self.cameras, SIZE, _VERSION, sorted(recorded)]
         return artifacts.hash_json([artifacts.hash_arrays(*(recorded[name] for name in sorted(recorded))), how])
 
     def read(self, episode: int) -> Iterator[Sequence[Frame]]:
@@ -155,6 +158,13 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
     columns: Columns | None = ((recorded[0], -1),) if recorded else None
     if columns is None and kwargs.get("exclude_current_positions_from_observation", True):
         columns = next((found for start, found in IN_OBSERVATIONS.items() if entry_point.startswith(start)), None)
+        if columns is not None and spec.get("additional_wrappers"):
+            wrappers = ", ".join(str(wrapper.get("name")) for wrapper in spec["additional_wrappers"])
+            raise BadInput(
+                f"{what} records no qpos, and wrappers ({wrappers}) may "
+                f"have changed the observations of {spec.get('id')}, which hold it otherwise. Record infos/state/qpos, "
+                "or give --frames FOLDER with a video of each episode"
+            )
     if columns is None:
         raise BadInput(
             f"{what} shows no frames: there are no pictures among its observations, its infos record no qpos, and the "
@@ -186,12 +196,20 @@ class Stage:
     def __init__(self, env: Any, entry_point: str, cameras: tuple[str, ...]) -> None:
         """Open a GL context; see `stage_of`."""
         self.env, self.model, self.data = env, env.model, env.data
+        compiled = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
+        mujoco.mj_saveModel(self.model, None, compiled)
+        self.model_sha256 = artifacts.hash_arrays(compiled)
         visual = self.model.vis
         visual.global_.offwidth = visual.global_.offheight = SIZE
         visual.quality.shadowsize = visual.quality.offsamples = 0
         self._put, self.scenery = next(
             ((put, needs(env)) for start, (put, needs) in SCENERY.items() if entry_point.startswith(start)), (_pose, ())
         )
+        if self._put is _pose and hasattr(env, "_render_callback"):
+            raise BadInput(
+                f"{entry_point} places targets only while it renders, in a way that is not known here; give --frames "
+                "FOLDER with a video of each episode"
+            )
         self._canvas = Canvas(self.model, tuple(_camera(env, name) for name in cameras or (None,)), SIZE)
         self._canvas.hide_sky()
 
@@ -211,10 +229,15 @@ def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
     """Return this process's stage, open until the process ends.
 
     Raises:
-        BadInput: the environment has no MuJoCo model, or no such camera.
+        BadInput: not an EnvSpec, not a registered environment, or one without a MuJoCo model or such a camera.
         ZestError: the environment cannot be made with the packages here, or no GL backend works.
     """
-    spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
+    try:
+        spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
+    except (ValueError, KeyError, TypeError) as error:
+        raise BadInput(f"the dataset's env_spec is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
+    check_registered(spec)
+    spec.additional_wrappers = ()  # what they change is not shown, and they are code
     try:
         with redirect_stderr(StringIO()):  # on import gymnasium_robotics prints news of its other environments
             env: Any = gymnasium.make(spec, disable_env_checker=True).unwrapped
