@@ -41,7 +41,9 @@ def relabel_frames(
     n_workers: int | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> RelabeledFrames:
-    """Write a copy of a dataset whose rewards are ZeST scores; the rewards that it came with are kept, unread.
+    """Write a copy of a dataset whose rewards are ZeST scores; the rewards that it came with are kept.
+
+    They, too, are hashed into the copy's name; nothing else depends on them.
 
     Args:
         source: episodes and their frames.
