@@ -110,7 +110,7 @@ def test_the_only_pictures_in_colour_are_chosen_and_several_must_be_named() -> N
     with pytest.raises(BadInput, match="it has several entries with pictures: obs/a/left, obs/a/right; choose with"):
         choose_pictures(two, (), "it", "obs")
     assert choose_pictures(two, ("obs/a/right", "a/left"), "it", "obs") == ["a/right", "a/left"]
-    with pytest.raises(BadInput, match="it has no pictures at 'state'; entries with pictures: obs/a/left, obs/a/right"):
+    with pytest.raises(BadInput, match="it has no pictures at 'state', and there is no such folder; entries with pict"):
         choose_pictures(two, ("state",), "it", "obs")
     with pytest.raises(BadInput, match="it has no entry with pictures"):
         choose_pictures({"state": None}, (), "it")

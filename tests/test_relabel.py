@@ -337,7 +337,7 @@ def test_nothing_flows_from_the_ground_truth_into_rewards_or_policies(
             ["zest/kitchen-micro-tinny-v0"],
             "there is no dataset 'zest/kitchen-micro-tinny-v0'.*did you mean 'zest/",
         ),
-        (["../tiny-v0"], "a dataset id must look like 'namespace/name-v0'.*got '../tiny-v0'"),
+        (["../tiny-v0"], "there is no file or folder ../tiny-v0; give .* or a Minari id"),
         ([SOURCE, "--embedder", "efficientnet-lite"], "unknown embedder.*did you mean 'efficientnet-lite0'"),
         ([SOURCE, "--embedder", "timm:resnet10t@/none.pth"], "/none.pth is not a file"),
         ([SOURCE, "--goal", "drawing"], "unknown goal 'drawing': it is neither 'same-scene', 'drawings'"),
