@@ -23,7 +23,7 @@ from zest_rl.errors import BadInput, ZestError
 from zest_rl.goals import read_free_goal
 from zest_rl.parallel import map_jobs, one_thread, read_arrays
 from zest_rl.scorer import embed_goal_cached, goals_near, how_scored
-from zest_rl.scores import Features, Similarity, check_names, score_views, zero_deltas
+from zest_rl.scores import Features, Similarity, check_goal_share, check_names, score_views, zero_deltas
 from zest_rl.sources.base import Frames, Source
 from zest_rl.types import FloatArray
 
@@ -45,8 +45,7 @@ class FrameScorerConfig:
 
     def __post_init__(self) -> None:
         check_names(self.features, self.similarity)
-        if not 0 < self.goal_share <= 1:
-            raise BadInput(f"goal_share must be in (0, 1], got {self.goal_share}")
+        check_goal_share(self.goal_share)
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,11 @@ def n_channels(entry: h5py.Dataset) -> int | None:
     return None if entry.dtype.kind not in "uf" else _channels(entry.shape[1:])
 
 
+def is_numbers(entry: h5py.Dataset) -> bool:
+    """Whether an entry holds numbers for a policy: no pictures, no text, a row per step."""
+    return n_channels(entry) is None and entry.dtype.kind in "biuf" and entry.ndim > 0
+
+
 def _is_jpeg(entry: h5py.Dataset) -> bool:
     ragged = h5py.check_vlen_dtype(entry.dtype)
     if ragged is not None:
@@ -136,7 +141,8 @@ def stored_rows(entry: h5py.Dataset) -> Iterator[NDArray[Any]]:
     """Yield what an entry holds as it is stored, `ROWS` steps at a time; text as the bytes of each row."""
     if h5py.check_vlen_dtype(entry.dtype) is not None:
         for row in range(len(entry)):
-            yield np.frombuffer(entry[row], np.uint8) if isinstance(entry[row], bytes) else entry[row]
+            value = entry[row]
+            yield np.frombuffer(value, np.uint8) if isinstance(value, bytes) else value
     else:
         yield from (entry[row : row + ROWS] for row in range(0, len(entry), ROWS))
 
@@ -156,7 +162,7 @@ def numbers(node: h5py.Group | h5py.Dataset) -> FloatArray:
     columns = [
         np.asarray(entry[()], dtype=np.float32).reshape(len(entry), -1)
         for entry in entries(node).values()
-        if n_channels(entry) is None and entry.dtype.kind in "biuf" and entry.ndim > 0
+        if is_numbers(entry)
     ]
     if not columns:
         raise BadInput(f"{node.name} holds pictures only; a policy here needs numbers to act on")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from zest_rl import artifacts, data
@@ -73,6 +74,53 @@ def relabeled_id(source_id: str, digest: str) -> str:
     return re.sub(r"-v(\d+)$", rf"-zest-{digest[:8]}-v\1", source_id)
 
 
+class AnyScorer(Protocol):
+    """What `record` asks of a scorer."""
+
+    @property
+    def config(self) -> Any:
+        """It says features, similarity and embedder."""
+
+    def describe(self) -> dict[str, Any]:
+        """Config and content hashes, JSON-ready."""
+
+
+def record(
+    scorer: AnyScorer,
+    source: Mapping[str, Any],
+    *,
+    reward: Reward,
+    shuffle: int | None,
+    kept: NDArray[np.intp] | None,
+    n_still: int,
+) -> dict[str, Any]:
+    """What a relabeled dataset tells of how it was made: ``description`` and ``zest`` of the writers.
+
+    Args:
+        scorer: what scored.
+        source: what was scored, JSON-ready.
+        reward: see `relabel`.
+        shuffle: see `relabel`.
+        kept: indices of the goals that were used; None: all.
+        n_still: frames without any change against their first frame.
+    """
+    config = scorer.config
+    return {
+        "description": f"Rewards are scores ({config.similarity}+{config.features}, {reward}) by {config.embedder}.",
+        "zest": {
+            "relabel": {
+                **source,
+                "reward": reward,
+                "shuffle": shuffle,
+                "kept_goals": None if kept is None else kept.tolist(),
+                "scorer": scorer.describe(),
+                "n_still_frames": n_still,
+                "provenance": artifacts.provenance(),
+            }
+        },
+    }
+
+
 def relabel(
     source_id: str,
     config: ScorerConfig,
@@ -127,19 +175,14 @@ def relabel(
             target_id,
             [rewards_from_scores(score, reward) for score in scores],
             scores,
-            description=(f"Rewards are scores ({config.similarity}+{config.features}, {reward}) by {config.embedder}."),
-            zest={
-                "relabel": {
-                    "source": source_id,
-                    "source_sha256": source_fingerprint,
-                    "reward": reward,
-                    "shuffle": shuffle,
-                    "kept_goals": None if kept is None else kept.tolist(),
-                    "scorer": scorer.describe(),
-                    "n_still_frames": n_still,
-                    "provenance": artifacts.provenance(),
-                }
-            },
+            **record(
+                scorer,
+                {"source": source_id, "source_sha256": source_fingerprint},
+                reward=reward,
+                shuffle=shuffle,
+                kept=kept,
+                n_still=n_still,
+            ),
             extra=lambda folder: _leave_scorer(folder, scorer),
         )
     return Relabeled(target_id, path, scorer, n_frames, n_still, already_there=False)

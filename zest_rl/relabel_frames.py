@@ -12,7 +12,7 @@ from pathlib import Path
 from zest_rl import artifacts, data
 from zest_rl.data_writer import write_scored
 from zest_rl.frame_scorer import FrameScorer, FrameScorerConfig
-from zest_rl.relabel import Reward, leave_goal, relabeled_id, rewards_from_scores, shuffled
+from zest_rl.relabel import Reward, leave_goal, record, relabeled_id, rewards_from_scores, shuffled
 from zest_rl.sources.base import Source
 
 
@@ -82,21 +82,19 @@ def relabel_frames(
             target_id,
             [rewards_from_scores(score, reward) for score in scores],
             scores,
-            description=(f"Rewards are scores ({config.similarity}+{config.features}, {reward}) by {config.embedder}."),
-            zest={
-                "relabel": {
+            **record(
+                scorer,
+                {
                     "source": trajectories.dataset_id,
                     "source_sha256": fingerprint,
                     "frames": source.frames.describe(),
                     "frames_sha256": artifacts.hash_json(digests),
-                    "reward": reward,
-                    "shuffle": shuffle,
-                    "kept_goals": None if kept_goals is None else kept_goals.tolist(),
-                    "scorer": scorer.describe(),
-                    "n_still_frames": n_still,
-                    "provenance": artifacts.provenance(),
-                }
-            },
+                },
+                reward=reward,
+                shuffle=shuffle,
+                kept=kept_goals,
+                n_still=n_still,
+            ),
             extra=lambda folder: leave_goal(folder, scorer.goal),
         )
     return RelabeledFrames(target_id, path, n_frames, scorer.n_embedded, n_still, already_there=False)

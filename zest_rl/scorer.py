@@ -23,7 +23,7 @@ from zest_rl.errors import BadInput, ZestError
 from zest_rl.frames import Views, canonical_states, scene_pair
 from zest_rl.goals import SAME_SCENE, GoalSpec, embed_goal, read_goal
 from zest_rl.parallel import one_thread, read_arrays, write_arrays
-from zest_rl.scores import NUMBERS, Features, Similarity, check_names, score_views, zero_deltas
+from zest_rl.scores import NUMBERS, Features, Similarity, check_goal_share, check_names, score_views, zero_deltas
 from zest_rl.tasks import get_task
 from zest_rl.types import FloatArray
 
@@ -44,8 +44,7 @@ class ScorerConfig:
 
     def __post_init__(self) -> None:
         check_names(self.features, self.similarity)
-        if not 0 < self.goal_share <= 1:
-            raise BadInput(f"goal_share must be in (0, 1], got {self.goal_share}")
+        check_goal_share(self.goal_share)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:

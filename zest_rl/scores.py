@@ -43,6 +43,16 @@ def check_names(features: str, similarity: str) -> None:
         raise BadInput(f"features {features!r} bring a similarity of their own, got {similarity!r}; leave it at 'cos'")
 
 
+def check_goal_share(share: float) -> None:
+    """Refuse a share of the goals that is not in (0, 1].
+
+    Raises:
+        BadInput: it is not.
+    """
+    if not 0 < share <= 1:
+        raise BadInput(f"goal_share must be in (0, 1], got {share}")
+
+
 def _check(name: str, embeddings: FloatArray, dim: int | None = None) -> Doubles:
     array = np.asarray(embeddings)
     if array.ndim != 2 or len(array) == 0:

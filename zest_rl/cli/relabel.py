@@ -9,7 +9,7 @@ import tyro
 
 from zest_rl.cli.ui import Ui, progress_in_parts
 from zest_rl.errors import BadInput
-from zest_rl.scores import Features, Similarity, check_names
+from zest_rl.scores import Features, Similarity, check_goal_share, check_names
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,7 @@ class Config:
 
     def __post_init__(self) -> None:
         check_names(self.features, self.similarity)
-        if not 0 < self.goal_share <= 1:
-            raise BadInput(f"goal_share must be in (0, 1], got {self.goal_share}")
+        check_goal_share(self.goal_share)
         if self.views < 1:
             raise BadInput(f"the number of views must be at least 1, got {self.views}")
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.errors import BadInput
-from zest_rl.observations import choose_pictures, entries, n_channels
+from zest_rl.observations import choose_pictures, entries, is_numbers, n_channels
 from zest_rl.sources import imported
 from zest_rl.sources.imported import Imported
 from zest_rl.sources.pictures import Pictures, picture_entries
@@ -69,7 +69,7 @@ def _read(demo: h5py.Group) -> Imported:
     rewards = np.asarray(demo["rewards"][()], np.float32) if "rewards" in demo else np.full(len(actions), np.nan, "f4")
     obs = {}
     for path, entry in entries(demo["obs"]).items():
-        if n_channels(entry) is None and entry.dtype.kind in "biuf" and entry.ndim > 0:
+        if is_numbers(entry):
             rows: FloatArray = np.asarray(entry[()], np.float32).reshape(len(entry), -1)
             after = demo.get(f"next_obs/{path}")
             last = rows[-1:] if after is None else np.asarray(after[-1:], np.float32).reshape(1, -1)
