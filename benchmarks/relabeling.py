@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl import artifacts, collect, data
+from zest_rl import artifacts, collect, data, embed
 from zest_rl.data_writer import write_dataset
 from zest_rl.embed import STATES_PER_SHARD
 from zest_rl.frames import Views, canonical_states
@@ -105,7 +105,8 @@ def relabel_ms(episodes: dict[str, NDArray[Any]]) -> tuple[Scorer, float, float]
 
 def fill_cache(scorer: Scorer, states: NDArray[np.float64], vectors: NDArray[np.float32]) -> int:
     """Put all of `states` (N, 30) into the scorer's cache with (n, V, D) `vectors` in turn; return how many differ."""
-    distinct = np.unique(canonical_states(states, scorer.config.views), axis=0)
+    distinct, first = np.unique(canonical_states(states, scorer.config.views), axis=0, return_index=True)
+    distinct = distinct[np.argsort(first)]
     for path in scorer.states.folder.glob("*.npz"):
         path.unlink()
     for part in chunks(len(distinct), STATES_PER_SHARD):
@@ -123,6 +124,7 @@ def rescoring_seconds(config: ScorerConfig, episodes: list[NDArray[np.float64]])
     seconds = []
     for _ in range(N_ROUNDS):
         shutil.rmtree(artifacts.cache_dir() / "goals", ignore_errors=True)
+        embed._read_shard.cache_clear()
         start = cpu_seconds()
         scorer = Scorer.build(config, episodes[0][0], n_workers=1)
         scores, _ = scorer.score_episodes(episodes)
@@ -143,7 +145,7 @@ def run() -> dict[str, object]:
             episodes = concatenate([collect.rollout(behaviour, index) for index in range(N_RESCORED)])
             scorer, ours, per_state = relabel_ms({name: array[:N_RELABELED] for name, array in episodes.items()})
             states = list(episodes["qpos"])
-            vectors, _ = scorer.states.embed(np.concatenate(states[:N_RELABELED]))
+            vectors, _ = scorer.states.embedded(np.concatenate(states[:N_RELABELED]))
             n_distinct = fill_cache(scorer, np.concatenate(states), vectors)
             rescoring = {name: rescoring_seconds(config, states) for name, config in OTHERS.items()}
         finally:

@@ -282,6 +282,18 @@ def test_a_run_goes_on_at_the_episode_where_it_was_cut_and_ends_as_one_that_was_
     assert zest(*words)["n_episodes_embedded"] == 0
 
 
+def test_a_ray_cluster_of_its_own_makes_the_same_rewards(pictured: str, goal: Path, zest: Run, tmp_path: Path) -> None:
+    words = ["relabel", pictured, "--goal", goal, "--frames", "cameras/top"]
+    here = zest(*words, "--n-workers", "1")
+    expected = arrays(here["dataset"])
+    shutil.rmtree(here["path"])
+    shutil.rmtree(tmp_path / "cache" / "frames")
+    on_ray = zest(*words, "--engine", "ray", "--n-workers", "2")
+    assert (on_ray["dataset"], on_ray["n_episodes_embedded"]) == (here["dataset"], len(LENGTHS))
+    for name, array in arrays(on_ray["dataset"]).items():
+        np.testing.assert_array_equal(array, expected[name])
+
+
 def test_damaged_embeddings_are_noticed_and_made_again(
     pictured: str, goal: Path, zest: Run, refusal: Callable[..., tuple[int, str]], tmp_path: Path
 ) -> None:

@@ -2,7 +2,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tracemalloc
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +15,9 @@ from zest_rl import embed
 from zest_rl.embed import STATES_PER_SHARD, EmbedConfig, StateEmbedder
 from zest_rl.embedders import load_embedder
 from zest_rl.envs import KitchenEnv
-from zest_rl.frames import Views
-from zest_rl.parallel import one_thread
+from zest_rl.errors import ZestError
+from zest_rl.frames import Views, canonical_states
+from zest_rl.parallel import chunks, one_thread, write_arrays
 
 VIEWS = Views("micro", n_views=2, size=96)
 CONFIG = EmbedConfig(VIEWS, "efficientnet-lite0")
@@ -39,6 +42,11 @@ def single(config: EmbedConfig = CONFIG) -> StateEmbedder:
     return StateEmbedder(config, n_workers=1)
 
 
+def embedded(embedder: StateEmbedder, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    embedder.embed(states)
+    return embedder.embedded(states)
+
+
 # --- once ---
 
 
@@ -47,7 +55,7 @@ def test_each_distinct_state_is_embedded_once_and_found_again_by_its_index() -> 
     states[:, ELBOW] += np.linspace(0, 1, 6)  # the robot is hidden
     states[3, MICROWAVE] += 1e-4  # within the tolerance
     embedder = single()
-    embeddings, index = embedder.embed(states)
+    embeddings, index = embedded(embedder, states)
     assert embeddings.shape == (3, 2, 1280)
     assert embeddings.dtype == np.float32
     assert embedder.n_embedded == 3
@@ -64,15 +72,15 @@ def test_each_distinct_state_is_embedded_once_and_found_again_by_its_index() -> 
 
 def test_what_was_embedded_is_taken_from_the_cache_by_the_same_object_and_by_the_next() -> None:
     first = single()
-    embeddings, _ = first.embed(opening(4))
+    embeddings, _ = embedded(first, opening(4))
     first.embed(opening(4))
     assert first.n_embedded == 4
 
     later = single()
-    again, _ = later.embed(opening(4)[::-1])
+    again, _ = embedded(later, opening(4)[::-1])
     assert later.n_embedded == 0
     np.testing.assert_array_equal(again, embeddings)
-    more, index = later.embed(np.concatenate([opening(4), opening(2, last=-0.1)]))
+    more, index = embedded(later, np.concatenate([opening(4), opening(2, last=-0.1)]))
     assert later.n_embedded == 1
     np.testing.assert_array_equal(more[index[:4]], embeddings[::-1])  # the states are sorted: opening is negative
 
@@ -91,7 +99,7 @@ def test_progress_is_told_in_shards_and_only_for_what_is_missing() -> None:
 @pytest.mark.parametrize("damage", ["cut off", "emptied", "overwritten", "removed"])
 def test_a_damaged_shard_is_embedded_again_and_replaced(damage: str) -> None:
     first = single()
-    expected, _ = first.embed(opening(2))
+    expected, _ = embedded(first, opening(2))
     first.embed(opening(2, last=-0.3))
     shards = sorted(first.folder.glob("*.npz"))
     assert len(shards) == 2
@@ -103,13 +111,49 @@ def test_a_damaged_shard_is_embedded_again_and_replaced(damage: str) -> None:
         shards[0].write_bytes(damaged[damage])
 
     second = single()
-    np.testing.assert_array_equal(second.embed(opening(2))[0], expected)
+    np.testing.assert_array_equal(embedded(second, opening(2))[0], expected)
     second.embed(opening(2, last=-0.3))
     assert 1 <= second.n_embedded <= 2
     third = single()
-    np.testing.assert_array_equal(third.embed(opening(2))[0], expected)
+    np.testing.assert_array_equal(embedded(third, opening(2))[0], expected)
     third.embed(opening(2, last=-0.3))
     assert third.n_embedded == 0
+
+
+def test_damage_that_shows_late_is_an_error_and_is_then_mended() -> None:
+    first = single()
+    expected, _ = embedded(first, opening(2))
+    (shard,) = first.folder.glob("*.npz")
+    content = bytearray(shard.read_bytes())
+    content[content.index(b"embeddings.npy") + 2000] ^= 1  # among the numbers, of which a checksum is kept
+    shard.write_bytes(content)
+    embed._read_shard.cache_clear()
+    with pytest.raises(ZestError, match="are missing or damaged; run the same command again"):
+        first.embedded(opening(2))
+    np.testing.assert_array_equal(embedded(first, opening(2))[0], expected)
+    assert first.n_embedded == 4, "the same object embeds them again"
+
+
+def test_memory_does_not_grow_with_the_number_of_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(embed, "_read_shard", lru_cache(maxsize=2)(embed._read_shard.__wrapped__))
+    states = canonical_states(opening(1200), VIEWS)
+    folder = single().folder
+    for part in chunks(len(states), STATES_PER_SHARD):
+        vectors = np.repeat(np.arange(part.start, part.stop, dtype=np.float32), 2560).reshape(-1, 2, 1280)
+        write_arrays(folder / f"{part.start}.npz", {"keys": states[part.start : part.stop], "embeddings": vectors})
+    tracemalloc.start()
+    try:
+        embedder = single()
+        embedder.embed(states)
+        for i, state in enumerate(states):
+            assert embedder.embedded(state[None])[0][0, 0, 0] in (i, i - 1, i + 1), (
+                "states within the tolerance are one"
+            )
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert embedder.n_embedded == 0
+    assert peak < 4e6 < states.shape[0] * 2 * 1280 * 4, "all embeddings are 12 MB"
 
 
 # --- the same bits, whichever way ---
@@ -123,7 +167,7 @@ def test_embedding_within_a_rollout_gives_the_bits_that_embedding_a_dataset_give
     assert online.n_embedded == 5
     assert not cache.exists(), "nothing is written during a rollout"
 
-    embeddings, index = single().embed(states)
+    embeddings, index = embedded(single(), states)
     np.testing.assert_array_equal(rows, embeddings[index])
 
 
@@ -134,7 +178,7 @@ def test_flush_leaves_what_a_rollout_embedded_in_the_cache() -> None:
     online.flush()
     later = single()
     np.testing.assert_array_equal(later.embed_now(opening(3)), rows)
-    embeddings, index = later.embed(opening(3))
+    embeddings, index = embedded(later, opening(3))
     np.testing.assert_array_equal(embeddings[index], rows)
     assert later.n_embedded == 0
     assert len(list(online.folder.glob("*.npz"))) == 1
@@ -144,11 +188,11 @@ def test_two_worker_processes_give_the_bits_of_one_and_end_quietly(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     states = opening(6)
-    here, _ = single().embed(states)
+    here, _ = embedded(single(), states)
     monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "of two"))
     monkeypatch.setattr(embed, "STATES_PER_SHARD", 2)
     spread = StateEmbedder(CONFIG, n_workers=2)
-    there, _ = spread.embed(states)
+    there, _ = embedded(spread, states)
     assert len(list(spread.folder.glob("*.npz"))) == 3
     np.testing.assert_array_equal(there, here)
     assert "Traceback" not in capfd.readouterr().err
@@ -173,7 +217,7 @@ def test_embeddings_do_not_depend_on_torchs_threads_and_leave_them_alone(
         for n_threads in (1, 3):
             monkeypatch.setenv("ZEST_CACHE", str(tmp_path / str(n_threads)))
             torch.set_num_threads(n_threads)
-            results.append(single().embed(opening(2))[0])
+            results.append(embedded(single(), opening(2))[0])
             assert torch.get_num_threads() == n_threads
     finally:
         torch.set_num_threads(before)

@@ -19,11 +19,14 @@ from numpy.typing import NDArray
 
 from zest_rl import artifacts
 from zest_rl.embedders import Embedder, Precision, load_embedder
+from zest_rl.errors import BadInput, ZestError
 from zest_rl.frames import Views, canonical_states, state_keys
-from zest_rl.parallel import chunks, map_jobs, one_thread, read_arrays, write_arrays
+from zest_rl.parallel import Engine, chunks, map_jobs, one_thread, read_array, write_arrays
 from zest_rl.types import FloatArray
 
 STATES_PER_SHARD = 32
+SHARDS_IN_MEMORY = 64
+"""Of 1.3 MB each with 8 views and the default embedder."""
 
 
 @dataclass(frozen=True)
@@ -47,88 +50,159 @@ def shared_embedder(uri: str, precision: Precision, device: str) -> Embedder:
     return load_embedder(uri, device=device, precision=precision)
 
 
-def _embed_states(job: tuple[EmbedConfig, NDArray[np.float64]]) -> dict[str, NDArray[np.generic]]:
-    config, states = job
-    renderer, embedder = config.views.shared_renderer(), config.load_embedder()
+def check_same_embedder(embedder: Embedder, fingerprint: str) -> None:
+    """Make sure that a worker's embedder is that of the process that asked: the cache goes by the latter.
+
+    Raises:
+        BadInput: weights, precision or versions differ between the machines.
+    """
+    if embedder.fingerprint != fingerprint:
+        raise BadInput(
+            f"embedder {embedder.uri} of this worker is not that of the process that asked: weights, precision or "
+            "versions differ; install the same on every node, and choose --precision fp32 or bf16"
+        )
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Some states to embed."""
+
+    config: EmbedConfig
+    states: NDArray[np.float64]
+    fingerprint: str
+    """Of the embedder."""
+
+
+def _embed_states(job: _Job) -> dict[str, NDArray[np.generic]]:
+    renderer, embedder = job.config.views.shared_renderer(), job.config.load_embedder()
+    check_same_embedder(embedder, job.fingerprint)
     with one_thread():
-        embeddings = [embedder.embed_images(list(renderer.render(state))) for state in states]
-    return {"keys": states, "embeddings": np.stack(embeddings)}
+        embeddings = [embedder.embed_images(list(renderer.render(state))) for state in job.states]
+    return {"keys": job.states, "embeddings": np.stack(embeddings)}
+
+
+@functools.lru_cache(maxsize=SHARDS_IN_MEMORY)
+def _read_shard(path: Path) -> FloatArray | None:
+    """Return the embeddings of a shard, which never changes; None when it is missing or damaged."""
+    return read_array(path, "embeddings")
 
 
 class StateEmbedder:
     """Embeds simulator states through a cache on disk."""
 
-    def __init__(self, config: EmbedConfig, *, n_workers: int | None = None) -> None:
+    def __init__(self, config: EmbedConfig, *, n_workers: int | None = None, engine: Engine = "local") -> None:
         """Open the cache of `config` (created when something is first written)."""
         self.config = config
-        self.n_workers = n_workers
+        self.n_workers, self.engine = n_workers, engine
         self.embedder = config.load_embedder()
         self.n_embedded = 0
         """States that were not in the cache and had to be rendered and embedded."""
         digest = artifacts.hash_json([config.views.fingerprint(), self.embedder.fingerprint])
         self.folder: Path = artifacts.cache_dir() / "embeddings" / digest[:20]
-        self._known: dict[bytes, FloatArray] = {}
-        self._unsaved: list[NDArray[np.float64]] = []
-        self._read: set[str] = set()
-        self._load()
+        self._where: dict[bytes, tuple[Path, int]] = {}
+        """State → its shard, and the row in it."""
+        self._new: dict[bytes, FloatArray] = {}
+        """What `embed_now` computed and no shard holds yet."""
+        self._read: set[Path] = set()
+        self._find()
 
-    def _load(self) -> None:
+    def _find(self) -> None:
+        """Learn which states the shards hold that came since; a damaged one is as good as none."""
         for path in sorted(self.folder.glob("*.npz")):
-            if path.name not in self._read and (shard := read_arrays(path)) is not None:
-                self._known.update(zip(state_keys(shard["keys"]), shard["embeddings"], strict=True))
-                self._read.add(path.name)
+            if path not in self._read and (keys := read_array(path, "keys")) is not None:
+                self._where.update((key, (path, row)) for row, key in enumerate(state_keys(keys)))
+                self._read.add(path)
 
-    def embed(
-        self, qpos: NDArray[np.float64], on_progress: Callable[[int, int], None] | None = None
-    ) -> tuple[FloatArray, NDArray[np.intp]]:
-        """Embed states, all cores at work on those that are not in the cache.
+    def embed(self, qpos: NDArray[np.float64], on_progress: Callable[[int, int], None] | None = None) -> None:
+        """Leave the embeddings of states in the cache, all cores at work on those that are not there.
 
         Args:
             qpos: (N, nq) simulator positions.
             on_progress: called with (shards done, shards in all).
+        """
+        states, first = np.unique(canonical_states(qpos, self.config.views), axis=0, return_index=True)
+        states = states[np.argsort(first)]  # as the episodes meet them, so that an episode needs few shards
+        missing = states[[key not in self._where for key in state_keys(states)]]
+        if len(missing) == 0:
+            return
+        jobs = {}
+        for chunk in chunks(len(missing), STATES_PER_SHARD):
+            part = missing[chunk.start : chunk.stop]
+            jobs[artifacts.hash_arrays(part)[:20]] = _Job(self.config, part, self.embedder.fingerprint)
+        done = 0
+
+        def count(_: str) -> None:
+            nonlocal done
+            done += 1
+            if on_progress is not None:
+                on_progress(done, len(jobs))
+
+        map_jobs(
+            _embed_states,
+            jobs,
+            self.folder,
+            n_workers=self.n_workers,
+            engine=self.engine,
+            device=self.config.device,
+            on_done=count,
+        )
+        self.n_embedded += len(missing)
+        self._find()
+
+    def embedded(self, qpos: NDArray[np.float64]) -> tuple[FloatArray, NDArray[np.intp]]:
+        """Read what `embed` left; a few shards are in memory at a time.
+
+        Args:
+            qpos: (N, nq) simulator positions, such as those of an episode.
 
         Returns:
             (U, V, D) float32 embeddings of the U distinct states, and (N,) the index of each state among them.
+
+        Raises:
+            ZestError: a file of the cache is damaged.
         """
         states, inverse = np.unique(canonical_states(qpos, self.config.views), axis=0, return_inverse=True)
-        keys = state_keys(states)
-        missing = states[[key not in self._known for key in keys]]
-        if len(missing):
-            jobs = {}
-            for chunk in chunks(len(missing), STATES_PER_SHARD):
-                part = missing[chunk.start : chunk.stop]
-                jobs[artifacts.hash_arrays(part)[:20]] = (self.config, part)
-            done = 0
+        rows = []
+        for key in state_keys(states):
+            if (row := self._row(key)) is None:
+                raise ZestError(f"embeddings in {self.folder} are missing or damaged; run the same command again")
+            rows.append(row)
+        return np.stack(rows), np.asarray(inverse).reshape(-1)
 
-            def count(_: str) -> None:
-                nonlocal done
-                done += 1
-                if on_progress is not None:
-                    on_progress(done, len(jobs))
-
-            map_jobs(_embed_states, jobs, self.folder, n_workers=self.n_workers, on_done=count)
-            self.n_embedded += len(missing)
-            self._load()
-        return np.stack([self._known[key] for key in keys]), np.asarray(inverse).reshape(-1)
+    def _row(self, key: bytes) -> FloatArray | None:
+        """Return the (V, D) embeddings of a state, or None; a damaged shard is removed and forgotten."""
+        if key in self._new:
+            return self._new[key]
+        if key not in self._where:
+            return None
+        path, row = self._where[key]
+        if (embeddings := _read_shard(path)) is not None:
+            found: FloatArray = embeddings[row]
+            return found
+        path.unlink(missing_ok=True)
+        _read_shard.cache_clear()
+        self._read.discard(path)
+        self._where = {other: place for other, place in self._where.items() if place[0] != path}
+        return None
 
     def embed_now(self, qpos: NDArray[np.float64]) -> FloatArray:
         """Embed states in this process, for use within a rollout: (N, nq) → (N, V, D). Call `flush` at the end."""
         states = canonical_states(qpos, self.config.views)
         rows = []
         for state, key in zip(states, state_keys(states), strict=True):
-            if key not in self._known:
-                self._known[key] = np.asarray(_embed_states((self.config, state[None]))["embeddings"][0], np.float32)
-                self._unsaved.append(state)
+            if (row := self._row(key)) is None:
+                job = _Job(self.config, state[None], self.embedder.fingerprint)
+                self._new[key] = row = np.asarray(_embed_states(job)["embeddings"][0], np.float32)
                 self.n_embedded += 1
-            rows.append(self._known[key])
+            rows.append(row)
         return np.stack(rows)
 
     def flush(self) -> None:
         """Leave what `embed_now` computed in the cache."""
-        if self._unsaved:
-            states = np.stack(self._unsaved)
+        keys, rows = list(self._new), list(self._new.values())
+        for part in chunks(len(keys), STATES_PER_SHARD):
+            states = np.stack([np.frombuffer(key) for key in keys[part.start : part.stop]])
             path = self.folder / f"{artifacts.hash_arrays(states)[:20]}.npz"
-            embeddings = np.stack([self._known[key] for key in state_keys(states)])
-            write_arrays(path, {"keys": states, "embeddings": embeddings})
-            self._read.add(path.name)
-            self._unsaved.clear()
+            write_arrays(path, {"keys": states, "embeddings": np.stack(rows[part.start : part.stop])})
+        self._new.clear()
+        self._find()

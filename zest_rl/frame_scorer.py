@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl import artifacts
-from zest_rl.embed import shared_embedder
+from zest_rl.embed import check_same_embedder, shared_embedder
 from zest_rl.embedders import Precision
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.goals import read_free_goal
-from zest_rl.parallel import map_jobs, one_thread, read_arrays
+from zest_rl.parallel import Engine, map_jobs, one_thread, read_arrays
 from zest_rl.scorer import embed_goal_cached, goals_near, how_scored
 from zest_rl.scores import Features, Similarity, check_goal_share, check_names, score_views, zero_deltas
 from zest_rl.sources.base import Frames, Source
@@ -58,10 +58,13 @@ class _Job:
     embedder: str
     precision: Precision
     device: str
+    fingerprint: str
+    """Of the embedder."""
 
 
 def _embed_episode(job: _Job) -> dict[str, NDArray[np.generic]]:
     embedder = shared_embedder(job.embedder, job.precision, job.device)
+    check_same_embedder(embedder, job.fingerprint)
     steps = islice(job.frames.read(job.episode), job.n_steps + 2)  # one more than there may be shows that it is wrong
     parts = []
     with one_thread():
@@ -81,18 +84,26 @@ def _embed_episode(job: _Job) -> dict[str, NDArray[np.generic]]:
 class FrameScorer:
     """Scores frames by a goal: φ of `zest_rl.scores`, averaged over goals and views."""
 
-    def __init__(self, config: FrameScorerConfig, *, device: str = "auto", n_workers: int | None = None) -> None:
+    def __init__(
+        self,
+        config: FrameScorerConfig,
+        *,
+        device: str = "auto",
+        n_workers: int | None = None,
+        engine: Engine = "local",
+    ) -> None:
         """Read and embed the goal.
 
         Args:
             config: what is scored how.
             device: where the embedder runs.
             n_workers: processes that embed, default one per core.
+            engine: processes of this machine, or workers of a Ray cluster.
 
         Raises:
             BadInput: the goal cannot be read, or the embedder does not read its kind.
         """
-        self.config, self.device, self.n_workers = config, device, n_workers
+        self.config, self.device, self.n_workers, self.engine = config, device, n_workers, engine
         self.goal = read_free_goal(config.goal)
         self.embedder = shared_embedder(config.embedder, config.precision, device)
         self.starts, self.goals = embed_goal_cached(self.goal, self.embedder)
@@ -114,8 +125,9 @@ class FrameScorer:
             ZestError: a worker process died; finished episodes are kept.
         """
         config, n_steps = self.config, source.trajectories.n_steps
+        how = (config.embedder, config.precision, self.device, self.embedder.fingerprint)
         jobs = {
-            self._name(digest): _Job(source.frames, i, n_steps[i], config.embedder, config.precision, self.device)
+            self._name(digest): _Job(source.frames, i, n_steps[i], *how)
             for i, digest in enumerate(digests)
             if not self._path(digest).exists()
         }
@@ -127,7 +139,15 @@ class FrameScorer:
             if on_progress is not None:
                 on_progress(n_done, len(digests))
 
-        map_jobs(_embed_episode, jobs, self._folder, n_workers=self.n_workers, on_done=count)
+        map_jobs(
+            _embed_episode,
+            jobs,
+            self._folder,
+            n_workers=self.n_workers,
+            engine=self.engine,
+            device=self.device,
+            on_done=count,
+        )
         self.n_embedded += len(jobs)
 
     def embedded(self, source: Source, digests: list[str]) -> Iterator[FloatArray]:

@@ -8,24 +8,24 @@ import sys
 import threading
 import zipfile
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl import artifacts
-from zest_rl.errors import BadInput, ZestError
+from zest_rl import artifacts, ray_engine
+from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.ray_engine import Arrays, Job
 
-Job = TypeVar("Job")
-Arrays = Mapping[str, NDArray[Any]]
+Engine = Literal["local", "ray"]
 _STARTING = threading.Lock()
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -83,12 +83,25 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+DAMAGED = (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile)
+"""What reading a damaged ``.npz`` file may raise; RuntimeError: damaged zip flags."""
+
+
 def read_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
     """Read an ``.npz`` file whole, or return None when it is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile):  # RuntimeError: damaged zip flags
+    except DAMAGED:
+        return None
+
+
+def read_array(path: Path, name: str) -> NDArray[Any] | None:
+    """Read one array of an ``.npz`` file, or return None when it is missing or damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return np.asarray(file[name])
+    except DAMAGED:
         return None
 
 
@@ -109,6 +122,8 @@ def map_jobs(
     folder: Path,
     *,
     n_workers: int | None = None,
+    engine: Engine = "local",
+    device: str = "cpu",
     on_done: Callable[[str], None] | None = None,
 ) -> None:
     """Leave the arrays of ``work(job)`` in ``folder/NAME.npz`` for every job; what is there already is not done again.
@@ -118,23 +133,47 @@ def map_jobs(
         jobs: name → job. The name must identify the job's content.
         folder: where results are left.
         n_workers: number of processes, default one per core; this process is one of them.
+        engine: processes of this machine, or workers of a Ray cluster (`zest_rl.ray_engine`).
+        device: what the work runs on; Ray gives its workers GPUs by it.
         on_done: called with the name of each job when its file is there, also for those found finished.
 
     Raises:
-        BadInput: `n_workers` is below 1.
+        BadInput: `n_workers` is below 1, or there is no such engine.
         ZestError: a worker process died (out of memory, killed). What was finished is kept.
     """
     if n_workers is not None and n_workers < 1:
         raise BadInput(f"the number of workers must be at least 1, got {n_workers}; leave it out for one per core")
+    if engine not in get_args(Engine):
+        raise BadInput(f"unknown engine {engine!r}; {nearest(engine, get_args(Engine))}")
     missing = []
     for name in jobs:
         if read_arrays(folder / f"{name}.npz") is None:
             missing.append(name)
         elif on_done is not None:
             on_done(name)
-    n_workers = min(n_workers or n_cores(), len(missing))
-    paths = {name: folder / f"{name}.npz" for name in missing}
-    todo = deque(missing)
+    run = _run_on_ray if engine == "ray" else _run_here
+    with closing(run(work, {name: jobs[name] for name in missing}, folder, n_workers, device)) as done:
+        for name in done:
+            if on_done is not None:
+                on_done(name)
+
+
+def _run_on_ray(
+    work: Callable[[Job], Arrays], jobs: Mapping[str, Job], folder: Path, n_workers: int | None, device: str
+) -> Generator[str, None, None]:
+    with closing(ray_engine.run_jobs(work, jobs, n_workers=n_workers, device=device)) as results:
+        for name, arrays in results:
+            write_arrays(folder / f"{name}.npz", arrays)
+            yield name
+
+
+def _run_here(
+    work: Callable[[Job], Arrays], jobs: Mapping[str, Job], folder: Path, n_workers: int | None, device: str
+) -> Generator[str, None, None]:
+    """Do all jobs in this process and ``n_workers - 1`` others; the work chooses its device itself."""
+    n_workers = min(n_workers or n_cores(), len(jobs))
+    paths = {name: folder / f"{name}.npz" for name in jobs}
+    todo = deque(jobs)
     finished: SimpleQueue[tuple[str, BaseException | None]] = SimpleQueue()
 
     def take() -> str | None:
@@ -168,15 +207,14 @@ def map_jobs(
                 submit()
         all_started.set()
         try:
-            for _ in missing:
+            for _ in jobs:
                 if finished.empty() and (own := take()) is not None:
                     _run_job(work, jobs[own], paths[own])
                     finished.put((own, None))
                 name, error = finished.get()
                 if error is not None:
                     raise error
-                if on_done is not None:
-                    on_done(name)
+                yield name
         except BrokenProcessPool as error:
             raise ZestError(
                 f"a worker process died before all of {len(jobs)} parts were done (killed, or out of memory); "

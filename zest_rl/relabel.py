@@ -16,6 +16,7 @@ from zest_rl import artifacts, data
 from zest_rl.data_writer import write_relabeled
 from zest_rl.errors import BadInput, nearest
 from zest_rl.goals import GoalSpec
+from zest_rl.parallel import Engine
 from zest_rl.scorer import Scorer, ScorerConfig
 from zest_rl.types import FloatArray
 
@@ -129,6 +130,7 @@ def relabel(
     shuffle: int | None = None,
     device: str = "auto",
     n_workers: int | None = None,
+    engine: Engine = "local",
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Relabeled:
     """Write a copy of a dataset whose rewards are ZeST scores; the ground truth stays in the infos, unread.
@@ -140,6 +142,7 @@ def relabel(
         shuffle: null control: give each episode the scores of another one, drawn with this seed.
         device: where the embedder runs.
         n_workers: processes that render and embed, default one per core.
+        engine: processes of this machine, or workers of a Ray cluster; the rewards are the same.
         on_progress: called with (parts embedded, parts in all).
 
     Raises:
@@ -147,7 +150,7 @@ def relabel(
         ZestError: the disk is full or read-only; nothing is left behind.
     """
     states = data.read_states(source_id)
-    scorer = Scorer.build(config, states[0][0], device=device, n_workers=n_workers)
+    scorer = Scorer.build(config, states[0][0], device=device, n_workers=n_workers, engine=engine)
     source_fingerprint = data.fingerprint(source_id)
     digest = artifacts.hash_json([source_fingerprint, scorer.fingerprint(), reward, shuffle])
     target_id = relabeled_id(source_id, digest)

@@ -12,6 +12,7 @@ from pathlib import Path
 from zest_rl import artifacts, data
 from zest_rl.data_writer import write_scored
 from zest_rl.frame_scorer import FrameScorer, FrameScorerConfig
+from zest_rl.parallel import Engine
 from zest_rl.relabel import Reward, leave_goal, record, relabeled_id, rewards_from_scores, shuffled
 from zest_rl.sources.base import Source
 
@@ -39,6 +40,7 @@ def relabel_frames(
     shuffle: int | None = None,
     device: str = "auto",
     n_workers: int | None = None,
+    engine: Engine = "local",
     on_progress: Callable[[int, int], None] | None = None,
 ) -> RelabeledFrames:
     """Write a copy of a dataset whose rewards are ZeST scores; the rewards that it came with are kept.
@@ -52,6 +54,7 @@ def relabel_frames(
         shuffle: null control: give each episode the scores of another one, drawn with this seed.
         device: where the embedder runs.
         n_workers: processes that read and embed, default one per core.
+        engine: processes of this machine, or workers of a Ray cluster; the rewards are the same.
         on_progress: called with (episodes embedded, episodes in all).
 
     Raises:
@@ -59,7 +62,7 @@ def relabel_frames(
         ZestError: the disk is full or read-only; nothing is left behind but finished embeddings.
     """
     trajectories = source.trajectories
-    scorer = FrameScorer(config, device=device, n_workers=n_workers)
+    scorer = FrameScorer(config, device=device, n_workers=n_workers, engine=engine)
     digests = [source.frames.digest(episode) for episode in range(len(trajectories.n_steps))]
     fingerprint = trajectories.fingerprint()
     kept = [None if r is None else artifacts.hash_arrays(r) for r in trajectories.source_rewards()]

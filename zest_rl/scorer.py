@@ -22,7 +22,7 @@ from zest_rl.embedders import Embedder, Precision
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.frames import Views, canonical_states, scene_pair
 from zest_rl.goals import SAME_SCENE, GoalSpec, embed_goal, read_goal
-from zest_rl.parallel import one_thread, read_arrays, write_arrays
+from zest_rl.parallel import Engine, one_thread, read_arrays, write_arrays
 from zest_rl.scores import NUMBERS, Features, Similarity, check_goal_share, check_names, score_views, zero_deltas
 from zest_rl.tasks import get_task
 from zest_rl.types import FloatArray
@@ -112,6 +112,7 @@ class Scorer:
         *,
         device: str = "auto",
         n_workers: int | None = None,
+        engine: Engine = "local",
     ) -> None:
         """Join the parts; use `Scorer.build` or `Scorer.load`.
 
@@ -122,12 +123,13 @@ class Scorer:
             goal_fingerprint: hash of the goal's content.
             device: where the embedder runs.
             n_workers: processes that embed many states, default one per core.
+            engine: processes of this machine, or workers of a Ray cluster.
         """
         self.config, self.starts, self.goals, self.goal_fingerprint = config, starts, goals, goal_fingerprint
         embed_config = EmbedConfig(config.views, config.embedder, config.precision, device)
         self.goal: GoalSpec | None = None
         """The goal itself; None when only its embeddings were loaded."""
-        self.states = StateEmbedder(embed_config, n_workers=n_workers)
+        self.states = StateEmbedder(embed_config, n_workers=n_workers, engine=engine)
 
     @classmethod
     def build(cls, config: ScorerConfig, scene_qpos: NDArray[np.float64], **options: Any) -> Self:
@@ -212,6 +214,7 @@ class Scorer:
             self.goal_fingerprint,
             device=states.config.device,
             n_workers=states.n_workers,
+            engine=states.engine,
         )
 
     def with_goals(self, kept: NDArray[np.intp]) -> Scorer:
@@ -230,13 +233,10 @@ class Scorer:
         self, states: Sequence[NDArray[np.float64]], on_progress: Callable[[int, int], None] | None
     ) -> Iterator[tuple[FloatArray, NDArray[np.intp]]]:
         """Yield per episode the (n, V, D) embeddings of x_0 and its distinct states, and which one each frame is."""
-        embeddings, index = self.states.embed(np.concatenate(list(states)), on_progress)
-        offset = 0
+        self.states.embed(np.concatenate(list(states)), on_progress)
         for episode in states:
-            steps = index[offset : offset + len(episode)]
-            offset += len(episode)
-            distinct, inverse = np.unique(steps, return_inverse=True)  # resting objects repeat their state
-            yield embeddings[np.concatenate([steps[:1], distinct])], inverse  # x_0 first, as the scores want it
+            distinct, inverse = self.states.embedded(episode)  # resting objects repeat their state
+            yield np.concatenate([distinct[inverse[:1]], distinct]), inverse  # x_0 first, as the scores want it
 
     def score_now(self, first: NDArray[np.float64], current: NDArray[np.float64]) -> FloatArray:
         """Score one state of each of N running episodes.

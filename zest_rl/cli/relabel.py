@@ -53,6 +53,8 @@ class Config:
     """auto, cpu, cuda, cuda:1, …"""
     n_workers: int | None = None
     """Processes; default one per core."""
+    engine: Literal["local", "ray"] = "local"
+    """Processes of this machine, or workers of the Ray cluster at RAY_ADDRESS (else one on this machine is started)."""
 
     def __post_init__(self) -> None:
         check_names(self.features, self.similarity)
@@ -117,6 +119,7 @@ def _from_states(config: Config, ui: Ui) -> dict[str, Any]:
             shuffle=config.shuffle,
             device=config.device,
             n_workers=config.n_workers,
+            engine=config.engine,
             on_progress=on_progress,
         )
     return {
@@ -152,6 +155,7 @@ def _from_frames(config: Config, ui: Ui) -> dict[str, Any]:
             shuffle=config.shuffle,
             device=config.device,
             n_workers=config.n_workers,
+            engine=config.engine,
             on_progress=on_progress,
         )
     return {

@@ -53,7 +53,7 @@ def open_source(dataset: str, *, frames: Sequence[str] = (), cameras: Sequence[s
     """
     if frames and cameras:
         raise BadInput("--camera renders recorded states, --frames says where pictures are; give one of them")
-    folders = [Path(one).expanduser() for one in frames if Path(one).expanduser().is_dir()]
+    folders = [Path(one).expanduser().resolve() for one in frames if Path(one).expanduser().is_dir()]
     if folders and len(folders) < len(frames):
         raise BadInput(f"--frames must be folders or entries of the dataset, not both; got {', '.join(frames)}")
     keys = [] if folders else frames
