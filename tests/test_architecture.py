@@ -16,11 +16,11 @@ PACKAGE = Path(zest_rl.__file__).parent
 ROOT = PACKAGE.parent
 
 ORDER = (
-    "load_order", "errors", "types", "artifacts", "parallel", "tasks", "observations", "data", "data_writer",
-    "metrics", "quality", "envs", "arm", "experts", "collect",
+    "load_order", "errors", "types", "artifacts", "ray_engine", "parallel", "tasks", "observations", "data",
+    "data_writer", "metrics", "quality", "envs", "arm", "experts", "collect",
     "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "looks", "selection",
     "footage", "relabel", "sources", "frame_scorer", "relabel_frames", "export", "agents",
-    "checkpoints", "training", "adoption", "evaluation", "report", "panels", "comparison", "inspection",
+    "checkpoints", "distributed", "training", "adoption", "evaluation", "report", "panels", "comparison", "inspection",
     "inspection_page", "candidates", "multistep",
     "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.inspect", "cli.select_footage",
     "cli.select", "cli.follow", "cli.export", "cli.train", "cli.adopt", "cli.evaluate", "cli.report", "cli.plans",

@@ -12,6 +12,8 @@ A run folder, and what each part of it is for::
 A run that was killed at any moment and is started again with the same arguments ends with the same bits as one that
 was not (on a CPU, with the same number of threads): weights, their average, optimizer, both random generators and the
 running means are restored from the last checkpoint, and rows of the log after it are dropped.
+
+Under ``torchrun`` the processes share the work (`zest_rl.distributed`); the first alone writes.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +40,7 @@ from zest_rl import artifacts
 from zest_rl.agents import get_agent
 from zest_rl.agents.base import DataFacts, Rules, autocast, check_fields, describe_data, resolve_precision
 from zest_rl.checkpoints import TrainState, resume, save_checkpoint, snapshot_folder
+from zest_rl.distributed import Group, joined, launched, local_index
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.types import Episode
 
@@ -81,7 +84,8 @@ def train(
 
     Raises:
         BadInput: an argument is out of range, the data do not suit, or `run_dir` holds another run.
-        ZestError: the loss is not finite, a checkpoint is damaged, or the folder cannot be written to.
+        ZestError: the loss is not finite, a checkpoint is damaged, the folder cannot be written to, or another process
+            of this training is gone.
     """
     definition = get_agent(agent)
     if not isinstance(config, definition.config):
@@ -91,6 +95,7 @@ def train(
     place = _find_device(device)
     facts = describe_data(episodes)
     sample = definition.sampler(config, facts, episodes)
+    launched().share(sample(np.random.default_rng(seed)))  # a batch that cannot be shared is refused before all else
     precision = resolve_precision(config.amp, place)
     request: dict[str, Any] = {
         "agent": agent,
@@ -103,20 +108,27 @@ def train(
         "precision": precision,
         "data_sha256": artifacts.hash_arrays(*(a for e in episodes for a in (e.obs, e.actions, e.rewards))),
     }
+    if launched().size > 1:
+        request["n_processes"] = launched().size
     taken = sorted(meta.keys() & {*request, *asdict(facts), *RESULT_KEYS})
     if taken:
         raise BadInput(f"meta must not use the keys {', '.join(taken)}, which meta.json has already; rename them")
     request |= meta
 
-    with artifacts.lock(run_dir):
-        _claim(run_dir, request)
-        if not (run_dir / "meta.json").exists():
+    with joined(place) as group, artifacts.lock(run_dir) if group.leads else nullcontext():
+        if group.leads:
+            _claim(run_dir, request)
+        group.agree(data_sha256=request["data_sha256"], precision=precision)  # and wait for the claim
+        finished = (run_dir / "meta.json").exists()
+        group.agree(finished=finished)
+        if not finished:
             with _torch_set_up(seed, arguments.threads, place):
                 state = TrainState.start(definition.build(config, facts).to(place), config.weight_decay, seed)
                 resume(run_dir, state)
+                group.agree(updates_done=state.update)
 
                 def draw_loss() -> Tensor:
-                    batch = {name: tensor.to(place) for name, tensor in sample(state.rng).items()}
+                    batch = {name: tensor.to(place) for name, tensor in group.share(sample(state.rng)).items()}
                     with autocast(precision, place):
                         return definition.loss(state.model, batch)
 
@@ -126,9 +138,12 @@ def train(
                         with artifacts.staged_folder(folder) as staging:
                             _write_policy(staging, state, request | {"n_updates": state.update}, facts)
 
-                _fit(run_dir, state, draw_loss, config, arguments, keep_snapshot, on_progress)
-            _write_policy(run_dir, state, request, facts)
-        shutil.rmtree(run_dir / "checkpoints", ignore_errors=True)
+                _fit(run_dir, state, draw_loss, config, arguments, keep_snapshot, on_progress, group)
+            if group.leads:
+                _write_policy(run_dir, state, request, facts)
+        if group.leads:
+            shutil.rmtree(run_dir / "checkpoints", ignore_errors=True)
+        group.agree()  # files are there when any of them returns
     return run_dir
 
 
@@ -164,18 +179,23 @@ def _fit(
     arguments: _Arguments,
     keep_snapshot: Callable[[], None],
     on_progress: Progress | None,
+    group: Group,
 ) -> None:
     params = list(state.params.values())
-    with _open_log(run_dir, state.update) as write_row:
+    log = _open_log(run_dir, state.update) if group.leads else nullcontext(lambda _update, _row: None)
+    with log as write_row:
         tick = row_tick = time.perf_counter()
         row_update = state.update
+        _draw_apart(arguments.seed, group, state.update)
         while state.update < arguments.n_updates:
             warm = min(1.0, (state.update + 1) / config.warmup_updates) if config.warmup_updates else 1.0
-            for group in state.optimizer.param_groups:
-                group["lr"] = config.learning_rate * warm
+            for options in state.optimizer.param_groups:
+                options["lr"] = config.learning_rate * warm
             loss = draw_loss()
             state.optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
+            loss = loss.detach()
+            group.average([loss, *(p.grad for p in params if p.grad is not None)])
             norm = nn.utils.clip_grad_norm_(params, config.grad_clip)
             state.optimizer.step()
             state.update += 1
@@ -197,11 +217,23 @@ def _fit(
                 state.recent, row_update, row_tick = [], state.update, now
                 if on_progress is not None:
                     on_progress(state.update, row)
+            if state.update % arguments.checkpoint_every == 0:
+                _draw_apart(arguments.seed, group, state.update)
+            if not group.leads:
+                continue
             every = arguments.snapshot_every
             if every is not None and state.update % every == 0 and state.update < arguments.n_updates:
                 keep_snapshot()  # before the checkpoint: a run that goes on from there does not come by here again
             if state.update % arguments.checkpoint_every == 0 and state.update < arguments.n_updates:
                 save_checkpoint(run_dir, state)
+
+
+def _draw_apart(seed: int, group: Group, update: int) -> None:
+    """Seed the processes that follow anew, at each checkpoint: they drop other units than the first, whose generator is
+    in the checkpoint, and the same ones whether the run was cut there or not.
+    """
+    if not group.leads:
+        torch.manual_seed(int(np.random.SeedSequence([seed, group.rank, update]).generate_state(1)[0]))
 
 
 @contextmanager
@@ -221,12 +253,19 @@ def _find_device(name: str) -> torch.device:
     kind, _, index = name.partition(":")
     if kind not in ("auto", "cpu", "cuda") or (index and not (kind == "cuda" and index.isdecimal())):
         raise BadInput(f"device must be auto, cpu, cuda or cuda:N, got {name!r}")
+    if index and launched().size > 1:
+        raise BadInput(
+            f"under torchrun each process takes a GPU of its own, got device {name!r}; use cuda, cpu or auto"
+        )
     n_cuda = torch.cuda.device_count()
     if kind == "cpu" or (kind == "auto" and n_cuda == 0):
         return torch.device("cpu")
-    if int(index or 0) >= n_cuda:
-        raise BadInput(f"device {name!r} is not there: {n_cuda} CUDA devices found; use cpu or auto")
-    return torch.device("cuda", int(index or 0))
+    gpu = int(index) if index else local_index()
+    if gpu >= n_cuda:
+        raise BadInput(
+            f"device cuda:{gpu} is not there: {n_cuda} CUDA devices found; use cpu or auto, or fewer processes"
+        )
+    return torch.device("cuda", gpu)
 
 
 # ------------------------------------------------------------------------------------------------------------- log

@@ -3,8 +3,8 @@
 A verb's module holds a frozen dataclass ``Config`` (its arguments) and ``run(config, ui) -> dict`` (a JSON-ready
 result). A verb with sub-verbs holds ``CONFIGS``, from sub-verb to config class, instead of ``Config``. Three keys of a
 result mean something to this frame: ``next`` is the command to type next, ``ok: False`` makes the exit code 1, and a
-module's own ``summary(result) -> str`` replaces the plain listing. Verb modules are imported when their verb is typed,
-and import heavy packages in ``run`` only, so that help answers at once.
+module's own ``summary(result) -> str`` replaces the plain listing; of an empty result nothing is printed. Verb modules
+are imported when their verb is typed, and import heavy packages in ``run`` only, so that help answers at once.
 
 stdout carries the result, stderr everything else.
 """
@@ -25,6 +25,7 @@ from typing import Any
 from zest_rl import __version__
 from zest_rl.cli.recipes import COMMON_FLAGS, parse_config
 from zest_rl.cli.ui import StreamUi
+from zest_rl.distributed import launched
 from zest_rl.errors import BadInput, ZestError, nearest
 
 VERBS = {
@@ -81,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if os.environ.get("ZEST_TRACEBACK"):
             traceback.print_exc()
         print(message if code == INTERRUPTED else f"error: {message}", file=sys.stderr)
-        if as_json:
+        if as_json and launched().leads:
             problem = {"type": type(error).__name__, "message": message, "exit_code": code}
             print(json.dumps({"error": problem}, indent=2))
         return code
@@ -121,9 +122,9 @@ def _run_verb(module: ModuleType, verb: str, words: list[str]) -> int:
     config, as_json = parse_config(config_class, words, verb)
     with redirect_stdout(sys.stderr):  # whatever a library prints must not mix with the result
         result: dict[str, Any] = module.run(config, StreamUi())
-    if as_json:
+    if as_json and result:
         print(json.dumps(result, indent=2, allow_nan=False))
-    else:
+    elif result:
         print(_readable(module, result))
     return 0 if result.get("ok", True) else 1
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 
 import tyro
 
-from zest_rl.cli.ui import Ui
+from zest_rl.cli.ui import SilentUi, Ui
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,15 +52,19 @@ def _with_arguments(agent: str, config: type[Any]) -> type[Any]:
 
 
 def run(config: Arguments, ui: Ui) -> dict[str, Any]:
-    """Train, or go on training."""
+    """Train, or go on training; of several processes under ``torchrun`` the first one tells."""
     from zest_rl.agents import AGENTS
+    from zest_rl.distributed import launched
     from zest_rl.evaluation import is_evaluable
 
+    first = launched().leads
     agent_class = AGENTS[config.agent].config
     agent_config = agent_class(**{field.name: getattr(config, field.name) for field in fields(agent_class)})
     name = config.dataset.split("/")[-1]
     run_dir = config.run_dir or Path("runs") / f"{name}-{config.agent}-seed{config.seed}"
-    meta = train_on_dataset(config, agent_config, run_dir, ui)
+    meta = train_on_dataset(config, agent_config, run_dir, ui if first else SilentUi())
+    if not first:
+        return {}
     quoted = shlex.quote(str(run_dir))
     return {
         "run": str(run_dir),
@@ -76,6 +80,7 @@ def train_on_dataset(config: Arguments, agent_config: Any, run_dir: Path, ui: Ui
     """Train `agent_config` on a dataset and leave its scorer, if it has one, in the run folder; return the meta."""
     from zest_rl import artifacts, data
     from zest_rl.checkpoints import snapshots
+    from zest_rl.distributed import launched
     from zest_rl.relabel import SCORER_FILE
     from zest_rl.training import train
 
@@ -104,7 +109,7 @@ def train_on_dataset(config: Arguments, agent_config: Any, run_dir: Path, ui: Ui
             on_progress=on_progress,
         )
     scorer = data.dataset_path(config.dataset) / SCORER_FILE
-    if scorer.exists():
+    if scorer.exists() and launched().leads:
         for folder in (run_dir, *snapshots(run_dir)):
             artifacts.write_bytes(folder / SCORER_FILE, scorer.read_bytes())
     meta: dict[str, Any] = artifacts.read_json(run_dir / "meta.json")
