@@ -2,8 +2,7 @@
 
 All of them draw the same batch and keep a share of its rows each, so that a training means the same however many
 processes it has: the batch size is that of all of them, and where nothing is random but the batches (no dropout), the
-weights agree with those of one process but for rounding. A Decision Transformer's loss is an average over the steps
-that are not padding, of which the shares have a few more or fewer: there they agree to about a thousandth.
+weights agree with those of one process but for rounding.
 """
 
 from __future__ import annotations
@@ -37,21 +36,27 @@ class Group:
         """Whether this is the one process that writes files and talks."""
         return self.rank == 0
 
-    def share(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return this process's rows of a batch.
+    def share(self, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], float]:
+        """Return this process's rows of a batch, and the weight of a loss that is an average over them.
+
+        The mean of all processes' weighted losses is the loss of the whole batch. A loss averages over rows, or, where
+        a batch has ``valid``, over its elements that are true.
 
         Raises:
-            BadInput: the processes would have unequal shares.
+            BadInput: there are fewer rows than processes.
         """
         if self.size == 1:
-            return batch
+            return batch, 1.0
         n_rows = len(next(iter(batch.values())))
-        if n_rows % self.size:
+        if n_rows < self.size:
             raise BadInput(
-                f"the batch size must be a multiple of the number of processes, got {n_rows} for {self.size}; choose "
-                "another --batch-size, which is that of all processes together"
+                f"the batch size must be at least the number of processes, got {n_rows} for {self.size}; choose a "
+                "larger --batch-size, which is that of all processes together"
             )
-        return {name: rows[self.rank :: self.size] for name, rows in batch.items()}
+        share = {name: rows[self.rank :: self.size] for name, rows in batch.items()}
+        if "valid" in batch:
+            return share, float(self.size * share["valid"].sum() / batch["valid"].sum())
+        return share, self.size * len(next(iter(share.values()))) / n_rows
 
     def average(self, tensors: Sequence[Tensor]) -> None:
         """Replace each tensor by its mean over the processes; all give the same shapes in the same order.

@@ -95,7 +95,7 @@ def train(
     place = _find_device(device)
     facts = describe_data(episodes)
     sample = definition.sampler(config, facts, episodes)
-    launched().share(sample(np.random.default_rng(seed)))  # a batch that cannot be shared is refused before all else
+    launched().share(sample(np.random.default_rng(seed)))  # a batch that is too small is refused before all else
     precision = resolve_precision(config.amp, place)
     request: dict[str, Any] = {
         "agent": agent,
@@ -128,9 +128,10 @@ def train(
                 group.agree(updates_done=state.update)
 
                 def draw_loss() -> Tensor:
-                    batch = {name: tensor.to(place) for name, tensor in group.share(sample(state.rng)).items()}
+                    rows, weight = group.share(sample(state.rng))
+                    batch = {name: tensor.to(place) for name, tensor in rows.items()}
                     with autocast(precision, place):
-                        return definition.loss(state.model, batch)
+                        return definition.loss(state.model, batch) * weight
 
                 def keep_snapshot() -> None:
                     folder = snapshot_folder(run_dir, state.update)

@@ -210,8 +210,8 @@ class Agent(Generic[ConfigT]):
     build: Callable[[ConfigT, DataFacts], nn.Module]
     """Model with fresh weights, drawn from torch's global generator."""
     sampler: Callable[[ConfigT, DataFacts, Sequence[Episode]], Sampler]
-    """From the data to a function that draws one batch."""
+    """From the data to a function that draws one batch; ``valid`` in it tells what is not padding."""
     loss: Callable[[nn.Module, Batch], Tensor]
-    """Scalar to minimise."""
+    """Scalar to minimise: an average over the batch's rows, or over the elements that are valid."""
     policy: Callable[[nn.Module, ConfigT, DataFacts, dict[str, Any], torch.device], Policy]
     """From a trained model (in eval mode, on the device) and the run's meta to a policy."""
