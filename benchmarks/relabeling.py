@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from zest_rl import artifacts, collect, data, embed
 from zest_rl.data_writer import write_dataset
 from zest_rl.embed import STATES_PER_SHARD
-from zest_rl.frames import Views, canonical_states
+from zest_rl.frames import Views, distinct_states
 from zest_rl.parallel import chunks, concatenate, one_thread, write_arrays
 from zest_rl.relabel import relabel
 from zest_rl.rendering import select_gl_backend
@@ -105,8 +105,7 @@ def relabel_ms(episodes: dict[str, NDArray[Any]]) -> tuple[Scorer, float, float]
 
 def fill_cache(scorer: Scorer, states: NDArray[np.float64], vectors: NDArray[np.float32]) -> int:
     """Put all of `states` (N, 30) into the scorer's cache with (n, V, D) `vectors` in turn; return how many differ."""
-    distinct, first = np.unique(canonical_states(states, scorer.config.views), axis=0, return_index=True)
-    distinct = distinct[np.argsort(first)]
+    distinct = distinct_states(states, scorer.config.views)
     for path in scorer.states.folder.glob("*.npz"):
         path.unlink()
     for part in chunks(len(distinct), STATES_PER_SHARD):

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from zest_rl import artifacts
 from zest_rl.embedders import Embedder, Precision, load_embedder
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.frames import Views, canonical_states, state_keys
-from zest_rl.parallel import Engine, chunks, map_jobs, one_thread, read_array, write_arrays
+from zest_rl.frames import Views, canonical_states, distinct_states, state_keys
+from zest_rl.parallel import Engine, chunks, counted, map_jobs, one_thread, read_array, write_arrays
 from zest_rl.types import FloatArray
 
 STATES_PER_SHARD = 32
@@ -120,8 +120,7 @@ class StateEmbedder:
             qpos: (N, nq) simulator positions.
             on_progress: called with (shards done, shards in all).
         """
-        states, first = np.unique(canonical_states(qpos, self.config.views), axis=0, return_index=True)
-        states = states[np.argsort(first)]  # as the episodes meet them, so that an episode needs few shards
+        states = distinct_states(qpos, self.config.views)  # as the episodes meet them: an episode needs few shards
         missing = states[[key not in self._where for key in state_keys(states)]]
         if len(missing) == 0:
             return
@@ -129,14 +128,6 @@ class StateEmbedder:
         for chunk in chunks(len(missing), STATES_PER_SHARD):
             part = missing[chunk.start : chunk.stop]
             jobs[artifacts.hash_arrays(part)[:20]] = _Job(self.config, part, self.embedder.fingerprint)
-        done = 0
-
-        def count(_: str) -> None:
-            nonlocal done
-            done += 1
-            if on_progress is not None:
-                on_progress(done, len(jobs))
-
         map_jobs(
             _embed_states,
             jobs,
@@ -144,7 +135,7 @@ class StateEmbedder:
             n_workers=self.n_workers,
             engine=self.engine,
             device=self.config.device,
-            on_done=count,
+            on_done=counted(on_progress, len(jobs)),
         )
         self.n_embedded += len(missing)
         self._find()

@@ -21,7 +21,7 @@ from zest_rl.embed import check_same_embedder, shared_embedder
 from zest_rl.embedders import Precision
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.goals import read_free_goal
-from zest_rl.parallel import Engine, map_jobs, one_thread, read_arrays
+from zest_rl.parallel import Engine, counted, map_jobs, one_thread, read_arrays
 from zest_rl.scorer import embed_goal_cached, goals_near, how_scored
 from zest_rl.scores import Features, Similarity, check_goal_share, check_names, score_views, zero_deltas
 from zest_rl.sources.base import Frames, Source
@@ -131,14 +131,6 @@ class FrameScorer:
             for i, digest in enumerate(digests)
             if not self._path(digest).exists()
         }
-        n_done = len(digests) - len(jobs)
-
-        def count(_: str) -> None:
-            nonlocal n_done
-            n_done += 1
-            if on_progress is not None:
-                on_progress(n_done, len(digests))
-
         map_jobs(
             _embed_episode,
             jobs,
@@ -146,7 +138,7 @@ class FrameScorer:
             n_workers=self.n_workers,
             engine=self.engine,
             device=self.device,
-            on_done=count,
+            on_done=counted(on_progress, len(digests), len(digests) - len(jobs)),
         )
         self.n_embedded += len(jobs)
 

@@ -69,6 +69,13 @@ def canonical_states(qpos: NDArray[np.float64], views: Views) -> NDArray[np.floa
     return states + 0.0  # −0.0 and 0.0 are one state
 
 
+def distinct_states(qpos: NDArray[np.float64], views: Views) -> NDArray[np.float64]:
+    """Canonical states, each once, in the order in which they first appear: (N, nq) → (U, nq)."""
+    states, first = np.unique(canonical_states(qpos, views), axis=0, return_index=True)
+    in_order: NDArray[np.float64] = states[np.argsort(first)]
+    return in_order
+
+
 def evenly_spaced(n: int, n_wanted: int) -> NDArray[np.intp]:
     """Indices of up to `n_wanted` of n frames, evenly spaced, the first and the last among them."""
     return np.unique(np.linspace(0, n - 1, min(n, n_wanted)).round().astype(np.intp)) if n else np.zeros(0, np.intp)

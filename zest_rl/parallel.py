@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
 import sys
@@ -83,7 +84,7 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-DAMAGED = (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile)
+DAMAGED = (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile)
 """What reading a damaged ``.npz`` file may raise; RuntimeError: damaged zip flags."""
 
 
@@ -101,7 +102,7 @@ def read_array(path: Path, name: str) -> NDArray[Any] | None:
     try:
         with np.load(path, allow_pickle=False) as file:
             return np.asarray(file[name])
-    except DAMAGED:
+    except (*DAMAGED, KeyError):
         return None
 
 
@@ -110,6 +111,16 @@ def write_arrays(path: Path, arrays: Arrays) -> None:
     artifacts.check_free_space(path.parent, sum(array.nbytes for array in arrays.values()))
     with artifacts.atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez(file, allow_pickle=False, **dict(arrays))
+
+
+def counted(
+    on_progress: Callable[[int, int], None] | None, total: int, n_done: int = 0
+) -> Callable[[str], None] | None:
+    """Return what `map_jobs` may call after each job, to tell `on_progress` of (jobs done, jobs in all)."""
+    if on_progress is None:
+        return None
+    numbers = itertools.count(n_done + 1)
+    return lambda _: on_progress(next(numbers), total)
 
 
 def _run_job(work: Callable[[Job], Arrays], job: Job, path: Path) -> None:

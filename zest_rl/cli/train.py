@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar
 import tyro
 
 from zest_rl.cli.ui import SilentUi, Ui
+from zest_rl.distributed import launched
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +55,6 @@ def _with_arguments(agent: str, config: type[Any]) -> type[Any]:
 def run(config: Arguments, ui: Ui) -> dict[str, Any]:
     """Train, or go on training; of several processes under ``torchrun`` the first one tells."""
     from zest_rl.agents import AGENTS
-    from zest_rl.distributed import launched
     from zest_rl.evaluation import is_evaluable
 
     first = launched().leads
@@ -80,7 +80,6 @@ def train_on_dataset(config: Arguments, agent_config: Any, run_dir: Path, ui: Ui
     """Train `agent_config` on a dataset and leave its scorer, if it has one, in the run folder; return the meta."""
     from zest_rl import artifacts, data
     from zest_rl.checkpoints import snapshots
-    from zest_rl.distributed import launched
     from zest_rl.relabel import SCORER_FILE
     from zest_rl.training import train
 
