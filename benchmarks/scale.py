@@ -138,12 +138,14 @@ def measure(dataset_id: str, cache: str, *words: str) -> dict[str, Any]:
         raise RuntimeError(err)
     result = json.loads(out)
     shutil.rmtree(result["path"])  # the next way to make it starts anew
-    return {
+    found = {
         "frames": result["n_frames"],
         "seconds": round(seconds, 1),
         "frames_per_s": round(result["n_frames"] / seconds, 1),
         "peak_gib": round(peak, 2),
     }
+    print(*words, found, file=sys.stderr, flush=True)  # the whole takes most of an hour
+    return found
 
 
 def kill_a_worker(dataset_id: str, cache: str, *words: str) -> dict[str, Any]:
