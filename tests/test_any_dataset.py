@@ -776,6 +776,9 @@ def test_a_lerobot_folder_becomes_a_minari_dataset(
     for episode, found in zip(maze, minari.load_dataset(made["dataset"]), strict=True):
         state = rows(episode, "observation").astype(np.float32)
         np.testing.assert_array_equal(found.observations["observation.state"][:-1], state[:-1])
+    for words, fps in (((), 10), (("--fps", "20"), 20)):
+        back = zest("export", made["dataset"], "--to", "lerobot", "--output", tmp_path / f"back{fps}", *words)
+        assert json.loads((Path(back["file"]) / "meta" / "info.json").read_text())["fps"] == fps
     videos[1].unlink()
     code, error = refusal("relabel", root, "--goal", goal)
     assert (code, "lacks videos/observation.images.top/chunk-000/file-001.mp4" in error) == (2, True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -161,19 +162,28 @@ def of_two_tasks(collected: str, zest: Callable[..., dict[str, Any]]) -> tuple[s
     return zest("relabel", collected, *small)["dataset"], zest("relabel", other, *small)["dataset"]
 
 
-def test_each_goal_scores_the_ends_of_all_tasks_as_their_own_views_show_them(of_two_tasks: tuple[str, str]) -> None:
-    inspections = [inspect(dataset) for dataset in of_two_tasks]
+def test_each_goal_scores_the_ends_of_all_tasks_as_their_own_views_show_them(
+    collected: str, scored: str, of_two_tasks: tuple[str, str]
+) -> None:
+    inspections = [inspect(dataset) for dataset in (*of_two_tasks, scored)]
     done: list[None] = []
-    means = confusion(inspections, n_workers=1, on_done=lambda: done.append(None))
-    assert len(done) == 2
+    compared = confusion(inspections, n_workers=1, on_done=lambda: done.append(None))
+    assert len(done) == 3
+    assert list(compared.sources.items()) == [(collected, "micro"), ("zest/kitchen-sdoor-tiny-v0", "sdoor")]
+    assert compared.row_names() == ("micro", "sdoor")
+    assert compared.own == (0, 1, 0), "what was relabeled twice is one row"
+    means = compared.means
+    assert means.shape == (2, 3)
     for i, dataset in enumerate(of_two_tasks):
         own = np.mean([score[-1] for score in data.read_scores(dataset)])
         assert means[i, i] == pytest.approx(own, abs=1e-5)
         assert means[i, i] > means[1 - i, i], "an open door looks more like itself than like another one"
         assert means[1 - i, i] != 0, "something is seen to change"
-    assert confusion_warnings(inspections, means) == {}
-    found = confusion_warnings(inspections, means[::-1])
-    assert set(found) == set(of_two_tasks)
+    assert confusion_warnings(inspections, compared) == {}
+    found = confusion_warnings(inspections, replace(compared, means=means[::-1]))
+    assert set(found) == {*of_two_tasks, scored}
+    again = replace(compared, sources={"zest/a-v0": "micro", "zest/b-v0": "micro"})
+    assert again.row_names() == ("micro (zest/a-v0)", "micro (zest/b-v0)")
     assert "the episodes of sdoor higher" in found[of_two_tasks[0]]
 
 
@@ -184,7 +194,10 @@ def test_the_page_shows_tasks_against_goals_and_does_without_where_scorers_are_o
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     words = ("inspect", *of_two_tasks, "--output", tmp_path / "page.html", "--n-workers", 1)
-    matrix = zest(*words)["goals_against_tasks"]
+    found = zest(*words)["goals_against_tasks"]
+    assert found["by_goal_of"] == list(of_two_tasks)
+    assert found["episodes_of"][1] == "zest/kitchen-sdoor-tiny-v0"
+    matrix = found["mean_scores"]
     assert np.shape(matrix) == (2, 2)
     page = (tmp_path / "page.html").read_text()
     assert "<h2>Tasks against goals</h2>" in page

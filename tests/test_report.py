@@ -90,7 +90,7 @@ def report(video: Path) -> Report:
                 QualityRow("a share", "of frames", ((0.25, float("nan"), float("nan")), (0.5, 0.4, 0.6))),
             ),
         ),
-        matrix=Matrix(("delta", "raw"), np.array([[0.61, 0.2], [0.1, 0.43]], np.float32)),
+        matrix=Matrix(("door", "knob"), ("delta", "raw"), np.array([[0.61, 0.2], [0.1, 0.43]], np.float32)),
         strips=(Strip("the best", (image, image), (0, 30), np.array([0.0, 1.2], np.float32)),),
         views=(Curve("all views", "score", steps, steps), Curve("view 1", "score", steps, 2 * steps)),
         pixels=(Scatter("change", steps[:3], steps[:3], 1.0, upward="a score", across="pixels", point="step"),),
@@ -174,7 +174,7 @@ def test_figures_that_are_not_finite_are_shown_as_a_dash(report: Report) -> None
         curves=(Curve("BC", "loss", np.zeros(2, np.float32), np.full(2, nan, np.float32)),),
         details={"config": {"target": nan, "limits": [inf, np.float32("nan")], "array": np.array([nan])}},
         quality=QualityTable(("d",), (QualityRow("q", "m", ((nan, nan, inf),)),)),
-        matrix=Matrix(("d",), np.full((1, 1), nan, np.float32)),
+        matrix=Matrix(("d",), ("d",), np.full((1, 1), nan, np.float32)),
         strips=(dataclasses.replace(report.strips[0], scores=np.array([nan, inf], np.float32)),),
     )
     html = render_html(broken)

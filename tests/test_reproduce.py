@@ -321,6 +321,8 @@ def test_one_task_may_have_several_datasets(tmp_path: Path) -> None:
         ("n_episodes = 2", 'rtg = "offline"', "'rtg' must be one of 'online', 'constant', 'schedule', got 'offline'"),
         ('agent = "bc"', 'agent = "bc"\npolicy = "onnx:x"', "either an agent or a policy, got 'bc' and 'onnx:x'"),
         ('agent = "bc"', 'policy = "onnx:x"\nhidden_size = 1', "[methods.'BC']: unknown key 'hidden_size'"),
+        ('agent = "bc"', 'policy = "onxn:x"', "[methods.'BC']: unknown kind of policy 'onxn'; did you mean 'onnx'?"),
+        ('agent = "bc"', 'policy = "d3rlpy:x.d3"', "[methods.'BC']: a Python belongs to d3rlpy:FILE.d3"),
         ('agent = "bc"', 'policy = "onnx:x"\nseed = 1', "'seed' is not for a recipe to set"),
         (
             "[relabel]",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -52,10 +53,27 @@ def _settings(inspection: Inspection) -> dict[str, Any]:
     }
 
 
+@dataclass(frozen=True)
+class Confusion:
+    """Where the episodes of each source end, by the goal of each dataset."""
+
+    sources: Mapping[str, str]
+    """The datasets that were relabeled → their tasks; one row each, however often one was relabeled."""
+    own: tuple[int, ...]
+    """The row of each dataset's own episodes."""
+    means: FloatArray
+    """Mean score (n_sources, n_datasets) float32."""
+
+    def row_names(self) -> tuple[str, ...]:
+        """Name each row by its task; sources of the same task by their ids, too."""
+        tasks = list(self.sources.values())
+        return tuple(f"{task} ({s})" if tasks.count(task) > 1 else task for s, task in self.sources.items())
+
+
 def confusion(
     inspections: Sequence[Inspection], *, n_workers: int | None = None, on_done: Callable[[], object] = lambda: None
-) -> FloatArray:
-    """Score where each dataset's episodes end by the goal of each: (n, n) float32, rows are datasets, columns goals.
+) -> Confusion:
+    """Score where the episodes of all end by the goal of each.
 
     Episodes are seen from the views of their own task, whatever the goal is of. A goal that is worth something scores
     those of its own task highest. Needs no ground truth.
@@ -68,28 +86,31 @@ def confusion(
     Raises:
         ZestError: a scorer is gone, or was made with another embedder or renderer than the ones here.
     """
-    ends = [[episode[[0, -1]] for episode in data.read_states(one.dataset_id)] for one in inspections]
-    means = np.empty((len(inspections), len(inspections)), dtype=np.float32)
+    seen = {str(one.made["source"]): one for one in inspections}
+    ends = [[episode[[0, -1]] for episode in data.read_states(one.dataset_id)] for one in seen.values()]
+    means = np.empty((len(seen), len(inspections)), dtype=np.float32)
     for column, goal_of in enumerate(inspections):
         goal = Scorer.load(data.dataset_path(goal_of.dataset_id) / SCORER_FILE, n_workers=n_workers)
-        for row, (episodes, seen_as) in enumerate(zip(ends, inspections, strict=True)):
-            scores, _ = goal.seen_as(seen_as.task).score_episodes(episodes)
+        for row, (episodes, shown) in enumerate(zip(ends, seen.values(), strict=True)):
+            scores, _ = goal.seen_as(shown.task).score_episodes(episodes)
             means[row, column] = np.mean([score[-1] for score in scores])
         on_done()
-    return means
+    rows = list(seen)
+    own = tuple(rows.index(str(one.made["source"])) for one in inspections)
+    return Confusion({source: one.task for source, one in seen.items()}, own, means)
 
 
-def confusion_warnings(inspections: Sequence[Inspection], means: FloatArray) -> dict[str, str]:
+def confusion_warnings(inspections: Sequence[Inspection], found: Confusion) -> dict[str, str]:
     """Find the goals that score the episodes of another task higher than those of their own: dataset → sentence."""
-    found = {}
-    for column, goal_of in enumerate(inspections):
-        best = int(np.argmax(means[:, column]))
-        if inspections[best].task != goal_of.task:
-            found[goal_of.dataset_id] = (
-                f"Its goal scores the episodes of {inspections[best].task} higher ({means[best, column]:.2f}) than its "
-                f"own ({means[column, column]:.2f})."
+    tasks, warnings = list(found.sources.values()), {}
+    for goal_of, own, means in zip(inspections, found.own, found.means.T, strict=True):
+        best = int(np.argmax(means))
+        if tasks[best] != goal_of.task:
+            warnings[goal_of.dataset_id] = (
+                f"Its goal scores the episodes of {tasks[best]} higher ({means[best]:.2f}) than its own "
+                f"({means[own]:.2f})."
             )
-    return found
+    return warnings
 
 
 def look_at(inspection: Inspection, *, n_workers: int | None = None) -> dict[str, Look]:
@@ -150,7 +171,7 @@ def _pixels(name: str, look: Look) -> Scatter:
 
 def inspection_report(
     inspections: Sequence[Inspection],
-    means: FloatArray | None,
+    compared: Confusion | None,
     warnings: Mapping[str, Sequence[str]],
     looks: Mapping[str, Mapping[str, Look]],
 ) -> Report:
@@ -158,7 +179,7 @@ def inspection_report(
 
     Args:
         inspections: one per dataset.
-        means: of `confusion`.
+        compared: of `confusion`.
         warnings: by dataset.
         looks: of `look_at`, by dataset; those that are missing are not shown.
     """
@@ -181,7 +202,7 @@ def inspection_report(
         summary_sentence=f"Datasets: {len(names)}, warnings: {n_warnings}. Nothing was trained.",
         warnings=tuple(f"{dataset}: {sentence}" for dataset, found in warnings.items() for sentence in found),
         quality=QualityTable(names, tuple(rows)),
-        matrix=None if means is None else Matrix(names, means),
+        matrix=None if compared is None else Matrix(compared.row_names(), names, compared.means),
         goals=tuple(
             goal_panel(name, one.dataset_id, scatter)
             for name, one, scatter in zip(names, inspections, scatters, strict=True)

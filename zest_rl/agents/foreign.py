@@ -71,6 +71,26 @@ class Source:
         return {"family": self.family, "words": list(self.words), "files": dict(self.files), "code": self.code}
 
 
+def parse(spec: str, python: str | None = None) -> tuple[str, str]:
+    """Split a spec (see the table above) into family and rest; no file needs to be there yet.
+
+    Raises:
+        BadInput: unknown family, nothing after the colon, or a Python that is missing or not wanted.
+    """
+    family, _, rest = spec.partition(":")
+    known = (*FAMILIES, *_registered())
+    if family not in known:
+        raise BadInput(f"unknown kind of policy {family!r}; {nearest(family, known)}")
+    if not rest.strip() and family in FAMILIES:
+        raise BadInput(f"{family}: must be followed by {'a command' if family == 'command' else 'a file'}, got nothing")
+    if (python is not None) != (family == "d3rlpy"):
+        raise BadInput(
+            f"a Python belongs to d3rlpy:FILE.d3 and to nothing else, got {python!r} with {family}:; "
+            "give --python /path/to/bin/python of the environment that has d3rlpy"
+        )
+    return family, rest
+
+
 def identify(spec: str, python: str | None = None) -> Source:
     """Find what a spec (see the table above) is about, and hash its files; nothing is run.
 
@@ -79,24 +99,14 @@ def identify(spec: str, python: str | None = None) -> Source:
         python: for ``d3rlpy:``, the Python that has d3rlpy.
 
     Raises:
-        BadInput: unknown family, nothing after the colon, a missing file, or a Python that is missing or not wanted.
+        BadInput: `parse` refuses the spec, or a file or the Python is missing.
     """
-    family, _, rest = spec.partition(":")
-    registered = _registered()
-    if family not in (*FAMILIES, *registered):
-        raise BadInput(f"unknown kind of policy {family!r}; {nearest(family, (*FAMILIES, *registered))}")
-    if not rest.strip() and family in FAMILIES:
-        raise BadInput(f"{family}: must be followed by {'a command' if family == 'command' else 'a file'}, got nothing")
-    if (python is not None) != (family == "d3rlpy"):
-        raise BadInput(
-            f"a Python belongs to d3rlpy:FILE.d3 and to nothing else, got {python!r} with {family}:; "
-            "give --python /path/to/bin/python of the environment that has d3rlpy"
-        )
+    family, rest = parse(spec, python)
     if family == "command":
         words = tuple(_absolute(word) for word in _split(rest))
         return Source(family, words, _files_of(words))
     if family not in FAMILIES:
-        entry = registered[family]
+        entry = _registered()[family]
         word = _absolute(rest)
         files = _files_of([word])
         version = entry.dist.version if entry.dist is not None else "unknown"

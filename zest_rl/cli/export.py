@@ -51,8 +51,9 @@ class Config:
     """The rewards as they are, their change, or the last one alone."""
     normalise: bool = False
     """Shift and scale the rewards to [0, 1] over the dataset."""
-    fps: int = 12
-    """Steps per second, which LeRobot's timestamps are made of; the kitchen's by default."""
+    fps: int | None = None
+    """Steps per second, which LeRobot's timestamps are made of; default: those of the LeRobot folder that the dataset
+    comes from, else the kitchen's, 12."""
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:

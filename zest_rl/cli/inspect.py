@@ -50,20 +50,20 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
             except ZestError as error:
                 ui.warn(f"no episode of {one.dataset_id} is shown: {error}")
             advance()
-    means = None
+    compared = None
     if len({one.task for one in inspections}) > 1:
         try:
             with ui.progress("goals against tasks", len(ids)) as advance:
-                means = confusion(inspections, n_workers=config.n_workers, on_done=advance)
+                compared = confusion(inspections, n_workers=config.n_workers, on_done=advance)
         except ZestError as error:
             ui.warn(f"goals were not compared across tasks: {error}")
         else:
-            for dataset, warning in confusion_warnings(inspections, means).items():
+            for dataset, warning in confusion_warnings(inspections, compared).items():
                 warnings[dataset].append(warning)
     for dataset, found in warnings.items():
         for warning in found:
             ui.warn(f"{dataset}: {warning}")
-    page = write_report(inspection_report(inspections, means, warnings, looks), config.output)
+    page = write_report(inspection_report(inspections, compared, warnings, looks), config.output)
     return {
         "datasets": {
             one.dataset_id: {
@@ -76,7 +76,9 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
             for label, one in zip(labels(inspections), inspections, strict=True)
         },
         "warnings": warnings,
-        "goals_against_tasks": None if means is None else means.tolist(),
+        "goals_against_tasks": None
+        if compared is None
+        else {"episodes_of": list(compared.sources), "by_goal_of": list(ids), "mean_scores": compared.means.tolist()},
         "report": str(page),
         "next": f"open {page} in a browser",
     }

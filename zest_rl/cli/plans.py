@@ -229,6 +229,7 @@ def config_of(agent: str) -> type[Any]:
 
 def _plan_method(recipe: Recipe, method: Mapping[str, Any], goals: Mapping[str, Any], where: str) -> PlannedMethod:
     from zest_rl.agents import AGENTS, get_agent
+    from zest_rl.agents.foreign import parse
     from zest_rl.cli import evaluate
     from zest_rl.cli.recipes import load_config
 
@@ -249,6 +250,8 @@ def _plan_method(recipe: Recipe, method: Mapping[str, Any], goals: Mapping[str, 
         if len(recipe.tasks) > 1 and "{task}" not in entry.policy:
             raise BadInput(f"{where}: with several tasks the policy must hold {{task}}, got {entry.policy!r}")
         training = {"policy": entry.policy, **table_of(flags, where, "dataset", "seed", "run_dir", "name")}
+        with located(where):
+            parse(entry.policy, training.get("python"))  # its files may be trained on the data that are made first
     else:
         training = {"n_updates": 5000, "threads": 1, "device": "cpu"}
         for table in (shared, of_agents.get(entry.maker, {}), flags):

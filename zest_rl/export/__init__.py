@@ -64,7 +64,7 @@ class Exported:
     n_bytes: int
 
 
-def export(dataset_id: str, to: Format, path: Path, rewards: Rewards = AS_RECORDED, fps: int = lerobot.FPS) -> Exported:
+def export(dataset_id: str, to: Format, path: Path, rewards: Rewards = AS_RECORDED, fps: int | None = None) -> Exported:
     """Write a dataset in another format, atomically.
 
     Args:
@@ -72,7 +72,8 @@ def export(dataset_id: str, to: Format, path: Path, rewards: Rewards = AS_RECORD
         to: the format.
         path: the file, or the folder (`FOLDERS`); it must not exist.
         rewards: how the dataset's rewards are handed on.
-        fps: steps per second; LeRobot alone records it.
+        fps: steps per second, which LeRobot alone records; None: as the dataset was recorded, if that is known, else
+            the kitchen's.
 
     Raises:
         BadInput: no such dataset, an unknown format, there is a file already, or the format would lose the rewards.

@@ -40,13 +40,17 @@ Columns = dict[str, NDArray[Any]]
 """Equally long arrays (T,) or (T, dim) by LeRobot's names."""
 
 
-def write(folder: Path, contents: Contents, fps: int = FPS) -> None:
+def write(folder: Path, contents: Contents, fps: int | None = None) -> None:
     """Write a dataset, with the side-car when the contents have scores.
+
+    Without `fps` the steps per second are those that the dataset was recorded with, if it says so, else the kitchen's.
 
     Raises:
         BadInput: `fps` is below 1.
         ZestError: pyarrow is not installed.
     """
+    if fps is None:
+        fps = round((contents.about["zest"] or {}).get("recorded", {}).get("fps", FPS))
     if fps < 1:
         raise BadInput(f"fps must be at least 1, got {fps}; give the steps per second of the robot")
     flat = contents.flat

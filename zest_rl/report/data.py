@@ -209,16 +209,19 @@ class QualityTable:
 
 @dataclass(frozen=True)
 class Matrix:
-    """Mean score of where the episodes of each dataset (rows) end, by the goal of each (columns)."""
+    """Mean score of where the episodes of each source (rows) end, by the goal of each dataset (columns)."""
 
-    names: tuple[str, ...]
+    episodes: tuple[str, ...]
+    goals: tuple[str, ...]
     values: FloatArray
-    """(n, n) float32."""
+    """(n_episodes, n_goals) float32."""
 
     def __post_init__(self) -> None:
-        if self.values.shape != (len(self.names), len(self.names)):
-            n = len(self.names)
-            raise BadInput(f"a matrix of {n} datasets must have shape ({n}, {n}), got {self.values.shape}")
+        shape = (len(self.episodes), len(self.goals))
+        if self.values.shape != shape:
+            raise BadInput(
+                f"a matrix of {shape[0]} sources and {shape[1]} goals must have shape {shape}, got {self.values.shape}"
+            )
 
 
 @dataclass(frozen=True)

@@ -235,15 +235,15 @@ def _quality(table: QualityTable) -> str:
 
 
 def _matrix(matrix: Matrix) -> str:
-    head = "".join(f'<th scope="col" class="num">{escape(name)}</th>' for name in matrix.names)
+    head = "".join(f'<th scope="col" class="num">{escape(name)}</th>' for name in matrix.goals)
     highest = matrix.values.argmax(axis=0)
     rows = []
-    for i, (name, values) in enumerate(zip(matrix.names, matrix.values, strict=True)):
+    for i, (name, values) in enumerate(zip(matrix.episodes, matrix.values, strict=True)):
         cells = "".join(
             f'<td class="num" data-label="{escape(goal)}">'
             + (f"<b>{number(float(value))}</b>" if highest[j] == i else number(float(value)))
             + "</td>"
-            for j, (goal, value) in enumerate(zip(matrix.names, values, strict=True))
+            for j, (goal, value) in enumerate(zip(matrix.goals, values, strict=True))
         )
         rows.append(f'<tr><th scope="row">{escape(name)}</th>{cells}</tr>')
     return _wide_table("Episodes of ↓ by the goal of →", head, rows)

@@ -74,8 +74,10 @@ def stored(episode: Imported) -> dict[str, NDArray[Any]]:
     }
 
 
-def fill(folder: Path, dataset_id: str, episodes: Iterable[Imported], description: str) -> None:
-    """Write the files of a Minari dataset; see `zest_rl.data_writer.Trajectories`."""
+def fill(
+    folder: Path, dataset_id: str, episodes: Iterable[Imported], description: str, *, fps: float | None = None
+) -> None:
+    """Write the files of a Minari dataset, see `zest_rl.data_writer.Trajectories`; `fps` are steps per second."""
     import minari
     from gymnasium import spaces
     from minari.data_collector import EpisodeBuffer
@@ -108,4 +110,6 @@ def fill(folder: Path, dataset_id: str, episodes: Iterable[Imported], descriptio
             )
     metadata = artifacts.read_json(folder / METADATA_FILE)
     metadata |= {"dataset_id": dataset_id, "minari_version": minari.__version__, "description": description}
+    if fps is not None:
+        metadata["zest"] = {"recorded": {"fps": fps}}
     artifacts.write_json(folder / METADATA_FILE, metadata)

@@ -50,6 +50,8 @@ class Rows:
     """Columns with numbers that are observed."""
     others: tuple[str, ...]
     """Those of action, next.reward, next.done and next.truncated that there are."""
+    fps: float
+    """Steps per second."""
 
     @property
     def dataset_id(self) -> str:
@@ -71,7 +73,8 @@ class Rows:
 
     def fill(self, folder: Path) -> None:
         """Write them as a Minari dataset."""
-        imported.fill(folder, self.dataset_id, self.episodes(), f"Imported from {self.root.name} (LeRobot).")
+        description = f"Imported from {self.root.name} (LeRobot)."
+        imported.fill(folder, self.dataset_id, self.episodes(), description, fps=self.fps)
 
     def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
         """Yield what is written of each episode."""
@@ -233,7 +236,7 @@ def open_lerobot(root: Path, keys: Sequence[str], *, with_frames: bool = True) -
     others = tuple(name for name in ("action", "next.reward", "next.done", "next.truncated") if name in features)
     if "action" not in others:
         raise BadInput(f"{root} has no feature 'action', got {', '.join(features)}")
-    rows_ = Rows(root, files, n_steps, observed, others)
+    rows_ = Rows(root, files, n_steps, observed, others, fps)
     return rows_, Videos(tuple(views), fps, spans) if views else None
 
 
