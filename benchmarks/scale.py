@@ -1,6 +1,7 @@
 """Relabeling 200,000 frames: memory and frames per second of one process, two, and Ray's workers; and a killed worker.
 
-Frames are 64×64 renderings of the kitchen, shifted so that all differ, as JPEG in a Minari dataset of 200 episodes.
+Frames are 64×64 renderings of the kitchen, as JPEG in a Minari dataset of 200 episodes. No two episodes are equal, and
+embeddings are kept by episode, so every frame is embedded.
 
 - All 200,000 go through timm's smallest transformer (0.4 million random weights, from a file), so that what is measured
   is reading, hashing, preprocessing, caching, scoring and writing. Memory is the proportional set size of the command

@@ -148,6 +148,8 @@ def test_lerobot_folders_hold_a_row_per_frame_and_progress_beside_them(scored: s
     assert (min(progress["progress_sparse"]), max(progress["progress_sparse"])) == (0, 1)
     alone = export(scored, "lerobot-progress", tmp_path / "progress.parquet").path
     assert parquet.read_table(alone).to_pydict() == progress
+    default = export(scored, "lerobot", tmp_path / "default").path
+    assert json.loads((default / "meta/info.json").read_text())["fps"] == 12
     with pytest.raises(BadInput, match="fps must be at least 1, got 0"):
         export(scored, "lerobot", tmp_path / "other", fps=0)
     assert not (tmp_path / "other").exists()

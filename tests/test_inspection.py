@@ -17,7 +17,7 @@ from zest_rl import data, metrics, quality, rendering
 from zest_rl.errors import BadInput
 from zest_rl.frames import Views
 from zest_rl.inspection import FIGURES, Inspection, inspect, warnings
-from zest_rl.inspection_page import confusion, confusion_warnings, inspection_report, labels
+from zest_rl.inspection_page import Confusion, confusion, confusion_warnings, inspection_report, labels
 from zest_rl.metrics import Estimate
 from zest_rl.relabel import relabel
 from zest_rl.report import render_html
@@ -169,7 +169,11 @@ def test_each_goal_scores_the_ends_of_all_tasks_as_their_own_views_show_them(
     done: list[None] = []
     compared = confusion(inspections, n_workers=1, on_done=lambda: done.append(None))
     assert len(done) == 3
-    assert list(compared.sources.items()) == [(collected, "micro"), ("zest/kitchen-sdoor-tiny-v0", "sdoor")]
+    ids = collected, "zest/kitchen-sdoor-tiny-v0"
+    assert list(compared.sources.items()) == [
+        ((ids[0], data.fingerprint(ids[0])), "micro"),
+        ((ids[1], data.fingerprint(ids[1])), "sdoor"),
+    ]
     assert compared.row_names() == ("micro", "sdoor")
     assert compared.own == (0, 1, 0), "what was relabeled twice is one row"
     means = compared.means
@@ -182,8 +186,21 @@ def test_each_goal_scores_the_ends_of_all_tasks_as_their_own_views_show_them(
     assert confusion_warnings(inspections, compared) == {}
     found = confusion_warnings(inspections, replace(compared, means=means[::-1]))
     assert set(found) == {*of_two_tasks, scored}
-    again = replace(compared, sources={"zest/a-v0": "micro", "zest/b-v0": "micro"})
-    assert again.row_names() == ("micro (zest/a-v0)", "micro (zest/b-v0)")
+
+
+def test_a_goal_that_scores_another_task_higher_is_told_though_a_sibling_scores_highest(
+    of_two_tasks: tuple[str, str],
+) -> None:
+    inspections = [inspect(dataset) for dataset in of_two_tasks]
+    a, b, c = ("zest/a-v0", "1" * 64), ("zest/b-v0", "2" * 64), ("zest/c-v0", "3" * 64)
+    means = np.array([[0.3, 0.1], [0.9, 0.1], [0.5, 0.8]], np.float32)
+    found = Confusion({a: "micro", b: "micro", c: "sdoor"}, (0, 2), means)
+    assert confusion_warnings(inspections, found) == {
+        of_two_tasks[0]: "Its goal scores the episodes of sdoor higher (0.50) than its own (0.30)."
+    }
+    assert found.row_names() == ("micro (zest/a-v0)", "micro (zest/b-v0)", "sdoor")
+    again = replace(found, sources={a: "micro", (a[0], b[1]): "micro", c: "sdoor"})
+    assert again.row_names() == ("micro (zest/a-v0, 11111111)", "micro (zest/a-v0, 22222222)", "sdoor")
     assert "the episodes of sdoor higher" in found[of_two_tasks[0]]
 
 

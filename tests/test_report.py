@@ -90,7 +90,9 @@ def report(video: Path) -> Report:
                 QualityRow("a share", "of frames", ((0.25, float("nan"), float("nan")), (0.5, 0.4, 0.6))),
             ),
         ),
-        matrix=Matrix(("door", "knob"), ("delta", "raw"), np.array([[0.61, 0.2], [0.1, 0.43]], np.float32)),
+        matrix=Matrix(
+            ("door", "knob"), ("delta", "raw", "text"), np.array([[0.61, 0.2, 0.3], [0.1, 0.43, 0.09]], np.float32)
+        ),
         strips=(Strip("the best", (image, image), (0, 30), np.array([0.0, 1.2], np.float32)),),
         views=(Curve("all views", "score", steps, steps), Curve("view 1", "score", steps, 2 * steps)),
         pixels=(Scatter("change", steps[:3], steps[:3], 1.0, upward="a score", across="pixels", point="step"),),
@@ -115,6 +117,17 @@ def test_every_section_shows_its_content(report: Report) -> None:
     assert html.count('class="point"') == 12 + 3
     assert html.count('src="data:video/mp4;base64,') == 2
     assert html.count('src="data:image/png;base64,') == html.count("alt=") == 3 + 2
+
+
+def test_a_matrix_has_a_row_per_task_and_the_highest_of_each_goal_in_bold(report: Report) -> None:
+    (table,) = re.findall(r"<table>(?:(?!</table>).)*by the goal of.*?</table>", render_html(report), re.DOTALL)
+    assert re.findall(r'<th scope="col" class="num">(.*?)</th>', table) == ["delta", "raw", "text"]
+    rows = re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', table)
+    shown = [(name, re.findall(r'data-label="(.*?)">(.*?)</td>', cells)) for name, cells in rows]
+    assert shown == [
+        ("door", [("delta", "<b>0.61</b>"), ("raw", "0.20"), ("text", "<b>0.30</b>")]),
+        ("knob", [("delta", "0.10"), ("raw", "<b>0.43</b>"), ("text", "0.09")]),
+    ]
 
 
 def test_an_empty_report_has_no_sections() -> None:
@@ -228,6 +241,8 @@ def test_parts_that_do_not_fit_together_are_refused(report: Report) -> None:
         dataclasses.replace(episode, gt_progress=three[:1], scores=None)
     with pytest.raises(BadInput, match="got zest_returns 3, gt_returns 4"):
         Scatter("s", three, four, 0.0)
+    with pytest.raises(BadInput, match=r"2 sources and 1 goals must have shape \(2, 1\), got \(1, 2\)"):
+        Matrix(("door", "knob"), ("delta",), np.zeros((1, 2), np.float32))
     with pytest.raises(BadInput, match="needs both low and high"):
         Curve("BC", "loss", three, three, low=three)
     with pytest.raises(BadInput, match=r"unknown kind 'metod'; did you mean 'method'"):

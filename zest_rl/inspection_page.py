@@ -57,17 +57,20 @@ def _settings(inspection: Inspection) -> dict[str, Any]:
 class Confusion:
     """Where the episodes of each source end, by the goal of each dataset."""
 
-    sources: Mapping[str, str]
-    """The datasets that were relabeled → their tasks; one row each, however often one was relabeled."""
+    sources: Mapping[tuple[str, str], str]
+    """Id and sha256 of what was relabeled → its task; one row each, however often one was relabeled."""
     own: tuple[int, ...]
     """The row of each dataset's own episodes."""
     means: FloatArray
     """Mean score (n_sources, n_datasets) float32."""
 
     def row_names(self) -> tuple[str, ...]:
-        """Name each row by its task; sources of the same task by their ids, too."""
-        tasks = list(self.sources.values())
-        return tuple(f"{task} ({s})" if tasks.count(task) > 1 else task for s, task in self.sources.items())
+        """Name each row by its task; sources of the same task by their ids, too, and if need be by their hashes."""
+        tasks, ids, names = list(self.sources.values()), [source for source, _ in self.sources], []
+        for (source, sha256), task in self.sources.items():
+            place = f"{source}, {sha256[:8]}" if ids.count(source) > 1 else source
+            names.append(f"{task} ({place})" if tasks.count(task) > 1 else task)
+        return tuple(names)
 
 
 def confusion(
@@ -86,7 +89,7 @@ def confusion(
     Raises:
         ZestError: a scorer is gone, or was made with another embedder or renderer than the ones here.
     """
-    seen = {str(one.made["source"]): one for one in inspections}
+    seen = {_source(one): one for one in inspections}
     ends = [[episode[[0, -1]] for episode in data.read_states(one.dataset_id)] for one in seen.values()]
     means = np.empty((len(seen), len(inspections)), dtype=np.float32)
     for column, goal_of in enumerate(inspections):
@@ -96,18 +99,22 @@ def confusion(
             means[row, column] = np.mean([score[-1] for score in scores])
         on_done()
     rows = list(seen)
-    own = tuple(rows.index(str(one.made["source"])) for one in inspections)
+    own = tuple(rows.index(_source(one)) for one in inspections)
     return Confusion({source: one.task for source, one in seen.items()}, own, means)
+
+
+def _source(inspection: Inspection) -> tuple[str, str]:
+    return str(inspection.made["source"]), str(inspection.made["source_sha256"])
 
 
 def confusion_warnings(inspections: Sequence[Inspection], found: Confusion) -> dict[str, str]:
     """Find the goals that score the episodes of another task higher than those of their own: dataset → sentence."""
     tasks, warnings = list(found.sources.values()), {}
     for goal_of, own, means in zip(inspections, found.own, found.means.T, strict=True):
-        best = int(np.argmax(means))
-        if tasks[best] != goal_of.task:
+        best = max((row for row, task in enumerate(tasks) if task != goal_of.task), key=means.__getitem__)
+        if means[best] > means[own]:
             warnings[goal_of.dataset_id] = (
-                f"Its goal scores the episodes of {tasks[best]} higher ({means[best]:.2f}) than its own "
+                f"Its goal scores the episodes of {found.row_names()[best]} higher ({means[best]:.2f}) than its own "
                 f"({means[own]:.2f})."
             )
     return warnings

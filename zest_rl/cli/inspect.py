@@ -15,7 +15,7 @@ from zest_rl.cli.ui import Ui
 @dataclass(frozen=True)
 class Config:
     """Judge the rewards of relabeled datasets: rankings against the ground truth where there is one, and what can be
-    said without it. With several datasets, one per task, also which task each goal scores highest.
+    said without it. With datasets of several tasks, also which task each goal scores highest.
     """
 
     datasets: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="DATASET [DATASET …]")]
@@ -23,7 +23,7 @@ class Config:
     output: Path = Path("inspection.html")
     """The HTML page."""
     n_workers: int | None = None
-    """Processes that embed, with several tasks; default one per core."""
+    """Processes that embed; default one per core."""
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
@@ -78,7 +78,11 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "warnings": warnings,
         "goals_against_tasks": None
         if compared is None
-        else {"episodes_of": list(compared.sources), "by_goal_of": list(ids), "mean_scores": compared.means.tolist()},
+        else {
+            "episodes_of": [source for source, _ in compared.sources],
+            "by_goal_of": list(ids),
+            "mean_scores": compared.means.tolist(),
+        },
         "report": str(page),
         "next": f"open {page} in a browser",
     }

@@ -50,7 +50,7 @@ def write(folder: Path, contents: Contents, fps: int | None = None) -> None:
         ZestError: pyarrow is not installed.
     """
     if fps is None:
-        fps = round((contents.about["zest"] or {}).get("recorded", {}).get("fps", FPS))
+        fps = max(1, round((contents.about["zest"] or {}).get("recorded", {}).get("fps", FPS)))
     if fps < 1:
         raise BadInput(f"fps must be at least 1, got {fps}; give the steps per second of the robot")
     flat = contents.flat

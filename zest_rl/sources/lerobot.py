@@ -64,8 +64,8 @@ class Rows:
         return 4 * sum((self.root / file).stat().st_size for file, _ in self.files)
 
     def fingerprint(self) -> str:
-        """Hash observations, actions and ends."""
-        return imported.fingerprint(self.episodes())
+        """Hash observations, actions and ends, and the frame rate, which the copy keeps."""
+        return artifacts.hash_json([imported.fingerprint(self.episodes()), self.fps])
 
     def source_rewards(self) -> Sequence[FloatArray | None]:
         """Read the rewards that the episodes came with."""
