@@ -90,13 +90,12 @@ def confusion(
         ZestError: a scorer is gone, or was made with another embedder or renderer than the ones here.
     """
     seen = {_source(one): one for one in inspections}
-    ends = [[episode[[0, -1]] for episode in data.read_states(one.dataset_id)] for one in seen.values()]
+    ends = [np.stack([e[[0, -1]] for e in data.read_states(one.dataset_id)], axis=1) for one in seen.values()]
     means = np.empty((len(seen), len(inspections)), dtype=np.float32)
     for column, goal_of in enumerate(inspections):
         goal = Scorer.load(data.dataset_path(goal_of.dataset_id) / SCORER_FILE, n_workers=n_workers)
-        for row, (episodes, shown) in enumerate(zip(ends, seen.values(), strict=True)):
-            scores, _ = goal.seen_as(shown.task).score_episodes(episodes)
-            means[row, column] = np.mean([score[-1] for score in scores])
+        for row, ((first, last), shown) in enumerate(zip(ends, seen.values(), strict=True)):
+            means[row, column] = goal.seen_as(shown.task).score_pairs(first, last).mean()
         on_done()
     rows = list(seen)
     own = tuple(rows.index(_source(one)) for one in inspections)
