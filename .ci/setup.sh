@@ -48,14 +48,26 @@ install_gl() {
     install_debian libosmesa6 || echo "libosmesa6 is not to be had; rendering goes through EGL alone"
 }
 
+# The first installation takes NEEDED_MB; pip would tell only when the disk is full.
+NEEDED_MB=7500
+check_room() {
+    local free_mb taken_mb
+    [ ! -x .venv/bin/zest ] || return 0
+    free_mb=$(df -Pm . | awk 'NR == 2 { print $4 }')
+    taken_mb=$({ du -sm .venv 2>/dev/null || true; } | cut -f 1)
+    [ $((free_mb + ${taken_mb:-0})) -ge $NEEDED_MB ] || fail "the tested packages need $NEEDED_MB MB of disk," \
+        "there are $free_mb MB free at $PWD; free some space (old .venv folders, pip cache purge), then try again"
+}
+
 install_python_packages() {
     local python
     python=$(find_python)
+    check_room
     if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
         "$python" -m venv --clear .venv || fail "$python cannot make a virtual environment;" \
             "Debian, Ubuntu: apt-get install python3-venv"
     fi
-    echo "installing the tested packages into .venv (some minutes, about 6 GB)"
+    echo "installing the tested packages into .venv (some minutes, about 7 GB)"
     .venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[dev]'
 }
 
