@@ -197,6 +197,23 @@ def test_the_verb_judges_the_frames_that_score_highest(root: Path, zest: Callabl
     assert {row["top"] for row in many["objects"].values()} == {4}, "two clips, of which two frames each reach the goal"
 
 
+def test_the_recipe_of_real_video_takes_the_folder_that_the_environment_names(
+    root: Path, tmp_path: Path, zest: Callable[..., dict[str, Any]], refusal: Callable[..., tuple[int, str]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    output = tmp_path / "out"
+    monkeypatch.delenv("ZEST_FOOTAGE", raising=False)
+    code, err = refusal("reproduce", "eval/footage.toml", "--output", output)
+    assert code == 2
+    assert "set the environment variable ZEST_FOOTAGE to it" in err
+    assert not output.exists()
+    monkeypatch.setenv("ZEST_FOOTAGE", str(root))
+    result = zest("reproduce", "eval/footage.toml", "--output", output)
+    assert set(result["objects"]) == set(THINGS)
+    kept = json.loads((output / "result.json").read_text())
+    assert kept["mean"] == result["mean"]
+
+
 def test_an_object_with_few_clips_is_left_out_and_named(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (root / VIDEOS / "1005.webm").unlink()
     words = ["select", "footage", str(root), "--layout", "something-something", "--n-frames", "4", "--top", "1"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -82,6 +83,14 @@ def test_in_the_kitchen_the_similarity_to_each_task_rises_as_it_is_done(zest: Ze
     html = page.read_text()
     assert "Sub-goals" in html
     assert "rise one after another, in the order of the sub-goals" in html
+    recipe = tmp_path / "doing.toml"
+    recipe.write_text('verb = "follow kitchen"\ntasks = ["knob3", "sdoor"]\nviews = 1\ntolerance = 5e-3\n')
+    again = zest("reproduce", recipe, "--n-workers", "1", "--output", tmp_path / "out")
+    assert again["sub_goals"] == result["sub_goals"]
+    kept = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert kept["sub_goals"] == result["sub_goals"]
+    assert "torch" in kept["provenance"]["versions"]
+    assert "Sub-goals" in (tmp_path / "out" / "report.html").read_text()
 
 
 @pytest.fixture

@@ -157,7 +157,7 @@ def read_plan(path: Path) -> Plan:
 
     table = read_recipe(path)
     if "verb" in table:
-        raise BadInput(f"recipe {path} is for one verb: zest {table['verb']} --recipe {path}")
+        raise BadInput(f"recipe {path} is for `zest {table['verb']} --recipe {path}`, not for `zest reproduce`")
     recipe = load_config(Recipe, table, f"recipe {path}")
     goals = {}
     for name, goal in recipe.goals.items():

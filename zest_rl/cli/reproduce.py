@@ -1,7 +1,8 @@
 """``zest reproduce``: a recipe → collected and relabeled datasets, trained and evaluated methods, tables and reports.
 
-What a recipe may hold is drawn in `zest_rl.cli.plans`, and in `zest_rl.cli.studies` for what trains nothing. Cells run
-side by side, one core each; a finished cell is never run again.
+What a recipe may hold is drawn in `zest_rl.cli.plans`, and in `zest_rl.cli.studies` for what trains nothing; with a key
+``verb = "follow …"`` or ``"select …"`` it holds the arguments of that verb. Cells run side by side, one core each; a
+finished cell is never run again.
 """
 
 from __future__ import annotations
@@ -10,15 +11,15 @@ import math
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from zest_rl.cli import inspect, studies
+from zest_rl.cli import follow, inspect, select, studies
 from zest_rl.cli.plans import Cell, Plan, TaskData, config_of, plan_cells, read_plan
-from zest_rl.cli.recipes import read_recipe
+from zest_rl.cli.recipes import load_config, read_recipe
 from zest_rl.cli.ui import SilentUi, Ui
 
 if TYPE_CHECKING:
@@ -27,6 +28,13 @@ if TYPE_CHECKING:
     from zest_rl.videos import Video
 
 POLL_SECONDS = 2.0
+
+STUDIES = {
+    f"{verb} {what}": (module, config)
+    for verb, module in (("follow", follow), ("select", select))
+    for what, config in module.CONFIGS.items()
+}
+"""Verbs that a recipe may be of: their module and arguments."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +58,11 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
     started = time.monotonic()
     output = config.output or Path("runs") / config.file.stem
-    if "study" in read_recipe(config.file):
+    recipe = read_recipe(config.file)
+    if str(recipe.get("verb")) in STUDIES:
+        result = _run_verb(config, recipe, output, ui)
+        return {**result, "seconds": round(time.monotonic() - started, 1)}
+    if "study" in recipe:
         return {
             **studies.run(config.file, output, ui, n_workers=config.n_workers),
             "seconds": round(time.monotonic() - started, 1),
@@ -109,6 +121,20 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "seconds": round(time.monotonic() - started, 1),
         "next": f"open {html} in a browser",
     }
+
+
+def _run_verb(config: Config, recipe: dict[str, Any], output: Path, ui: Ui) -> dict[str, Any]:
+    """Run the verb that the recipe is of; write result.json and, where the verb has a page, report.html."""
+    from zest_rl import artifacts
+
+    module, config_class = STUDIES[recipe.pop("verb")]
+    given = {"output": str(output / "report.html"), "n_workers": config.n_workers}
+    of_verb = {field.name for field in fields(config_class)}
+    recipe |= {key: value for key, value in given.items() if key in of_verb and value is not None}
+    result = module.run(load_config(config_class, recipe, f"recipe {config.file}"), ui)
+    kept = {key: value for key, value in result.items() if key not in ("report", "next")}
+    artifacts.write_json(output / "result.json", {**kept, "provenance": artifacts.provenance()})
+    return {**result, "result": str(output / "result.json")}
 
 
 def _result(
@@ -214,10 +240,10 @@ def _rows(table: tuple[MethodRow, ...]) -> dict[str, Any]:
 
 def summary(result: Mapping[str, Any]) -> str:
     """The table as text."""
-    if "study" in result:
-        return studies.summary(result)
-    if "goals_against_tasks" in result:
-        return inspect.summary(result)
+    of_others = {"study": studies, "goals_against_tasks": inspect, "follow": follow, "select": select}
+    for key, module in of_others.items():
+        if key in result:
+            return str(module.summary(result))
     lines = [
         f"{'':<28}{'% of expert':>12}  {'95 % interval':<18}{'success':>8}{'seeds':>7}{'episodes':>10}{'paper':>8}"
     ]
@@ -264,7 +290,6 @@ def _work(cell: Cell) -> dict[str, Any]:
     from zest_rl.agents.foreign import FOREIGN
     from zest_rl.checkpoints import snapshots
     from zest_rl.cli import adopt, evaluate, train
-    from zest_rl.cli.recipes import load_config
 
     make_run = adopt.run if cell.agent == FOREIGN else train.run
     make_run(load_config(config_of(cell.agent), cell.train, cell.method), SilentUi())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,7 +11,10 @@ from typing import Annotated, Any, ClassVar, Literal
 import tyro
 
 from zest_rl.cli.ui import Ui
+from zest_rl.errors import BadInput
 from zest_rl.scores import Features, Similarity
+
+FOOTAGE_VARIABLE = "ZEST_FOOTAGE"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,8 +24,9 @@ class FootageArguments:
     """
 
     what: ClassVar[str] = "footage"
-    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER")]
-    """Clips by object, FOLDER/OBJECT/CLIP.mp4 or FOLDER/OBJECT/CLIP/ with pictures; or Something-Something V2."""
+    folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="FOLDER")] = None
+    """Clips by object, FOLDER/OBJECT/CLIP.mp4 or FOLDER/OBJECT/CLIP/ with pictures; or Something-Something V2. Default:
+    the folder that the environment variable ZEST_FOOTAGE names."""
     layout: Literal["by-object", "something-something"] = "by-object"
     """How FOLDER is laid out."""
     template: str = "Opening [something]"
@@ -56,22 +61,22 @@ def run(config: FootageArguments, ui: Ui) -> dict[str, Any]:
 
     from zest_rl import footage, selection
     from zest_rl.embedders import load_embedder
-    from zest_rl.errors import BadInput
     from zest_rl.metrics import bootstrap
     from zest_rl.scores import check_names
 
+    folder = config.folder or _named_folder()
     check_names(config.features, config.similarity)
     if min(config.top, config.n_repeats) < 1 or (config.max_clips is not None and config.max_clips < 3):
         raise BadInput("--top and --n-repeats must be at least 1, and --max-clips at least 3")
     if config.layout == "by-object":
-        found = footage.folder_of_clips(config.folder)
+        found = footage.folder_of_clips(folder)
     else:
-        found = footage.something_something(config.folder, template=config.template)
+        found = footage.something_something(folder, template=config.template)
     things = footage.enough(found)
     for thing in dict.fromkeys(clip.thing for clip in found if clip.thing not in things):
         ui.warn(f"{thing!r} is left out: it has fewer than 3 clips, one for the goal and two to choose from")
     if not things:
-        raise BadInput(f"no object in {config.folder} has the 3 clips that a selection takes")
+        raise BadInput(f"no object in {folder} has the 3 clips that a selection takes")
     by_thing = {thing: [clip for clip in found if clip.thing == thing][: config.max_clips] for thing in things}
     clips = [clip for of_thing in by_thing.values() for clip in of_thing]
     embedder = load_embedder(config.embedder, device=config.device, precision=config.precision)
@@ -107,12 +112,23 @@ def run(config: FootageArguments, ui: Ui) -> dict[str, Any]:
     chance = float(np.mean([row["goal_frame_ratio"] for row in rows.values()]))
     return {
         "select": config.what,
-        "settings": {**asdict(config), "folder": str(config.folder), "embedder_sha256": embedder.fingerprint},
+        "settings": {**asdict(config), "folder": str(folder), "embedder_sha256": embedder.fingerprint},
         "objects": rows,
         "mean": {"top_n_success": mean, "goal_frame_ratio": chance, "times_random": mean / chance},
         "n_clips": len(clips),
-        "next": f"zest select footage {shlex.quote(str(config.folder))} --pool all",
+        "next": f"zest select footage {shlex.quote(str(folder))} --pool all",
     }
+
+
+def _named_folder() -> Path:
+    """Return the folder that the environment names; refuse when it names none."""
+    folder = os.environ.get(FOOTAGE_VARIABLE)
+    if not folder:
+        raise BadInput(
+            f"there is no folder of clips to select from: name it, zest select footage FOLDER, or set the environment "
+            f"variable {FOOTAGE_VARIABLE} to it"
+        )
+    return Path(folder)
 
 
 def summary(result: dict[str, Any]) -> str:
