@@ -159,12 +159,13 @@ def test_a_recipe_of_a_table_is_valid_and_found_from_anywhere(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("ZEST_VISUAL_TASKS", str(tmp_path))
+    for variable in ("ZEST_VISUAL_TASKS", "ZEST_FOOTAGE", "ZEST_RENDERED"):
+        monkeypatch.setenv(variable, str(tmp_path))
     if "\nstudy = " in path.read_text():
         study = read_study(Path("eval") / path.name)
         assert study.study.title
         assert study.settings
-        assert study.collect
+        assert bool(study.collect) == (study.study.study != "footage")
         return
     plan = read_plan(Path("eval") / path.name)
     assert plan.recipe.title

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -152,24 +153,28 @@ def test_clips_are_embedded_once(root: Path) -> None:
 def test_candidates_are_the_frames_of_the_other_clips() -> None:
     clips = [Clip(Path(str(i)), thing) for i, thing in enumerate("aaabb")]
     embeddings = [np.full((5, 2), 10 * i, np.float32) + np.arange(5, dtype=np.float32)[:, None] for i in range(5)]
-    narrow = candidates(clips, embeddings, 1, diverse=False, same_context=True, seed=0)
+    narrow = candidates(clips, embeddings, "a", left_out=1)
     assert set(narrow.clip) == {0, 2}
     assert len(narrow.embeddings) == 8, "x_0 is no candidate"
     np.testing.assert_array_equal(narrow.starts[:, 0], 10 * narrow.clip)
     assert round(5 * GOAL_SHARE) == 1
     np.testing.assert_array_equal(narrow.satisfies, narrow.embeddings[:, 0] % 10 == 4)
-    other = candidates(clips, embeddings, 1, diverse=True, same_context=False, seed=0)
+    other = candidates(clips, embeddings, "a", left_out=1, diverse=True, same_context=False)
     assert set(other.clip) == {0, 2, 3, 4}
     assert (other.starts[:, 0] != 10 * other.clip).all()
     assert set(other.starts[:, 0] / 10) <= {0, 2, 3, 4}
     assert set(other.clip[other.satisfies]) == {0, 2}, "the end of another object is no goal"
-    elsewhere = candidates(clips, embeddings, 1, diverse=False, same_context=False, seed=0)
+    elsewhere = candidates(clips, embeddings, "a", left_out=1, same_context=False)
     np.testing.assert_array_equal(elsewhere.starts[:, 0], 20 - 10 * elsewhere.clip)  # of the other one of two
-    assert enough(clips) == ["a"]
+    action = candidates(clips, embeddings, "a", diverse=True, any_thing=True)
+    assert set(action.clip[action.satisfies]) == {0, 1, 2, 3, 4}, "the end of another object shows the action"
+    assert set(candidates(clips, embeddings, "b").clip) == {3, 4}, "the goal is not one of these clips"
+    assert enough(clips, 3) == ["a"]
+    assert enough(clips, 2) == ["a", "b"]
 
 
 def test_the_verb_judges_the_frames_that_score_highest(root: Path, zest: Callable[..., dict[str, Any]]) -> None:
-    words = ("select", "footage", root, "--layout", "something-something", "--n-frames", N, "--top", 4)
+    words = ("select", "footage", root, "--n-frames", N, "--top", 4)
     narrow = zest(*words)
     assert set(narrow["objects"]) == set(THINGS)
     assert narrow["n_clips"] == 6
@@ -197,36 +202,107 @@ def test_the_verb_judges_the_frames_that_score_highest(root: Path, zest: Callabl
     assert {row["top"] for row in many["objects"].values()} == {4}, "two clips, of which two frames each reach the goal"
 
 
-def test_the_recipe_of_real_video_takes_the_folder_that_the_environment_names(
-    root: Path, tmp_path: Path, zest: Callable[..., dict[str, Any]], refusal: Callable[..., tuple[int, str]],
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.fixture
+def rendered(openings: dict[str, list[list[np.ndarray]]], tmp_path: Path) -> Path:
+    """One clip per object, as pictures by object: the same as the first video of each."""
+    for thing, clips in openings.items():
+        folder = tmp_path / "rendered" / thing / "clip"
+        folder.mkdir(parents=True)
+        for i, frame in enumerate(clips[0]):
+            Image.fromarray(frame).save(folder / f"{i}.png")
+    return tmp_path / "rendered"
+
+
+def test_other_clips_specify_the_goals(root: Path, rendered: Path, zest: Callable[..., dict[str, Any]]) -> None:
+    words = ("select", "footage", root, "--goals", rendered, "--n-frames", N, "--top", 4)
+    result = zest(*words)
+    embedder = load_embedder("efficientnet-lite0")
+    (goal,) = embed_clips([Clip(rendered / "oven" / "clip", "oven")], embedder, N)
+    videos = embed_clips([clip for clip in something_something(root) if clip.thing == "oven"], embedder, N)
+    scored = [
+        (score, t >= N - 2)
+        for clip in videos
+        for t, score in enumerate(score_delta(clip, goal[:1], goal[-1:]))
+        if t > 0
+    ]
+    share = np.mean([reached for _, reached in sorted(scored, reverse=True)[:4]])
+    row = result["objects"]["oven"]
+    assert (row["n_clips"], row["n_goals"]) == (3, 1), "no clip is left out: the goal is none of them"
+    assert row["top_n_success"]["value"] == pytest.approx(share)
+    (root / VIDEOS / "1000.webm").unlink()
+    assert set(zest(*words)["objects"]) == set(THINGS), "two clips are enough"
+    shutil.rmtree(rendered / "drawer")
+    assert set(zest(*words)["objects"]) == {"oven"}
+
+
+def test_an_action_is_found_in_the_clips_of_whatever_object(root: Path, zest: Callable[..., dict[str, Any]]) -> None:
+    words = ("select", "footage", root, "--n-frames", N, "--top", 4, "--pool", "all")
+    goals, actions = zest(*words), zest(*words, "--ask", "actions")
+    for thing in THINGS:
+        goal, action = goals["objects"][thing], actions["objects"][thing]
+        assert goal["goal_frame_ratio"] == pytest.approx(4 / 55)
+        assert action["goal_frame_ratio"] == pytest.approx(10 / 55)
+        assert action["top_n_success"]["value"] >= goal["top_n_success"]["value"]
+
+
+@pytest.mark.parametrize("pool", [(), ("--pool", "all", "--context", "different")])
+def test_actions_among_one_object_or_against_another_start_are_refused(
+    root: Path, refusal: Callable[..., tuple[int, str]], pool: tuple[str, ...]
+) -> None:
+    code, err = refusal("select", "footage", root, "--ask", "actions", *pool)
+    assert code == 2
+    assert "give --pool all" in err
+
+
+def test_a_study_of_real_video_is_one_call(
+    root: Path, rendered: Path, tmp_path: Path, zest: Callable[..., dict[str, Any]],
+    refusal: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     output = tmp_path / "out"
-    monkeypatch.delenv("ZEST_FOOTAGE", raising=False)
-    code, err = refusal("reproduce", "eval/footage.toml", "--output", output)
-    assert code == 2
-    assert "set the environment variable ZEST_FOOTAGE to it" in err
-    assert not output.exists()
     monkeypatch.setenv("ZEST_FOOTAGE", str(root))
-    result = zest("reproduce", "eval/footage.toml", "--output", output)
-    assert set(result["objects"]) == set(THINGS)
-    kept = json.loads((output / "result.json").read_text())
-    assert kept["mean"] == result["mean"]
+    monkeypatch.delenv("ZEST_RENDERED", raising=False)
+    words = ("reproduce", "eval/footage_actions_rendered.toml", "--output", output)
+    code, err = refusal(*words)
+    assert code == 2
+    assert "$ZEST_RENDERED names an environment variable that is not set" in err
+    assert not output.exists()
+    monkeypatch.setenv("ZEST_RENDERED", str(rendered))
+    (rendered / "oven" / "again").symlink_to(rendered / "oven" / "clip")
+    code, err = refusal(*words)
+    assert code == 2
+    assert "no object has 2 clips in" in err, "one rendered clip leaves none to select from"
+    (rendered / "oven" / "more").symlink_to(rendered / "oven" / "clip")
+    result = zest(*words)
+    assert [row["name"] for row in result["rows"]] == [
+        f"folder $ZEST_{folder}, goals $ZEST_{goals}"
+        for folder in ("FOOTAGE", "RENDERED")
+        for goals in ("FOOTAGE", "RENDERED")
+    ]
+    assert [set(row["tasks"]) for row in result["rows"]] == [set(THINGS), set(THINGS), {"oven"}, {"oven"}]
+    alone = zest("select", "footage", root, "--goals", rendered, "--ask", "actions", "--pool", "all")
+    assert result["rows"][1]["tasks"] == alone["objects"]
+    table = (output / "table.md").read_text()
+    for line in (
+        "| | oven | drawer | mean |",
+        "at random, pool all, $ZEST_RENDERED",
+        "| paper: ASDD, S2R, CLIP | 30.0 | 35.0",
+    ):
+        assert line in table
+    assert str(tmp_path) not in table
+    assert "Action selection among real and rendered clips" in (output / "report.html").read_text()
 
 
 def test_an_object_with_few_clips_is_left_out_and_named(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (root / VIDEOS / "1005.webm").unlink()
-    words = ["select", "footage", str(root), "--layout", "something-something", "--n-frames", "4", "--top", "1"]
+    words = ["select", "footage", str(root), "--n-frames", "4", "--top", "1"]
     assert cli.main(words) == 0
     out, err = capsys.readouterr()
-    assert "'drawer' is left out: it has fewer than 3 clips" in err
+    assert "'drawer' is left out: it needs 2 clips to choose from" in err
     assert "oven" in out
     assert "drawer" not in out
     (root / VIDEOS / "1000.webm").unlink()
     assert cli.main(words) == 2
-    assert "no object in" in capsys.readouterr().err
-    assert cli.main([*words[:3], "--n-frames", "4"]) == 2
-    assert "give --layout something-something" in capsys.readouterr().err
+    assert "no object has 2 clips in" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

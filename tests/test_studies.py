@@ -89,6 +89,7 @@ def test_a_study_selects_in_every_cell_and_puts_the_paper_beside(
         ("top = 3", 'task = "micro"', "'task' is not for a recipe to set"),
         ("top = 3", 'similarity = "l2"\nfeatures = "progress"', "bring a similarity of their own"),
         ("top = 3", "n-repeats = 0", "must be at least 1"),
+        ('study = "goals"', 'study = "footage"', "one of footage takes none"),
         ("{ micro = 92.0 }", "{}", "every row needs the figure of at least 1 task"),
     ],
 )

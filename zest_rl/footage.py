@@ -1,8 +1,8 @@
 """Real video: clips as files or as folders of pictures, and folders laid out as Something-Something V2.
 
 A clip shows one object that is acted on from its start to its end: its first frame is a start, its last one a goal, and
-its last `GOAL_SHARE` of frames count as reaching the goal of the same object. That reading is ours; Cui et al. 2022
-(§5.2) do not say which frames do.
+its last `GOAL_SHARE` of frames count as reaching the goal of the same object, and as showing the action that all clips
+share. That reading is ours; Cui et al. 2022 (§5.2) do not say which frames do.
 """
 
 from __future__ import annotations
@@ -101,6 +101,19 @@ def decoded(path: Path) -> Iterator[Frame]:
             yield np.asarray(frame, dtype=np.uint8)
 
 
+def find_clips(root: Path, template: str = OPENING) -> list[Clip]:
+    """Find the clips in a folder of either layout: `something_something` or `folder_of_clips`.
+
+    Args:
+        root: the folder.
+        template: the action; in a folder by object all clips are of it.
+
+    Raises:
+        BadInput: there is none.
+    """
+    return something_something(root, template=template) if (root / VIDEOS).exists() else folder_of_clips(root)
+
+
 def something_something(root: Path, things: Sequence[str] = OBJECTS, template: str = OPENING) -> list[Clip]:
     """Find the clips of one action on some objects in a folder laid out as Something-Something V2.
 
@@ -140,8 +153,6 @@ def folder_of_clips(root: Path) -> list[Clip]:
     Raises:
         BadInput: there is none.
     """
-    if (root / VIDEOS).exists():
-        raise BadInput(f"{root} is laid out as Something-Something V2; give --layout something-something")
     clips = [
         Clip(path, thing.name)
         for thing in _visible(root)
@@ -150,7 +161,10 @@ def folder_of_clips(root: Path) -> list[Clip]:
         if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES
     ]
     if not clips:
-        raise BadInput(f"{root} must hold a folder per object with videos, or folders of pictures, in it")
+        raise BadInput(
+            f"{root} must hold a folder per object with videos, or folders of pictures, in it, or {VIDEOS}/ and labels "
+            "as Something-Something V2 does"
+        )
     return clips
 
 
@@ -211,30 +225,40 @@ class Frames:
         return scores
 
 
-def enough(clips: Sequence[Clip]) -> list[str]:
-    """Return the objects with the 3 clips that a selection takes: one for the goal and two to choose from."""
+def enough(clips: Sequence[Clip], least: int) -> list[str]:
+    """Return the objects that have at least so many clips."""
     things = dict.fromkeys(clip.thing for clip in clips)
-    return [thing for thing in things if sum(clip.thing == thing for clip in clips) >= 3]
+    return [thing for thing in things if sum(clip.thing == thing for clip in clips) >= least]
 
 
 def candidates(
-    clips: Sequence[Clip], embeddings: Sequence[FloatArray], goal: int, *, diverse: bool, same_context: bool, seed: int
+    clips: Sequence[Clip],
+    embeddings: Sequence[FloatArray],
+    thing: str,
+    *,
+    diverse: bool = False,
+    any_thing: bool = False,
+    same_context: bool = True,
+    left_out: int | None = None,
+    seed: int = 0,
 ) -> Frames:
-    """Take the frames of all clips but the one that specifies the goal.
+    """Take the frames of clips, but for the clip that specifies the goal.
 
     Args:
-        clips: all of them, at least 3 of the goal's object.
+        clips: all of them; at least 2 are to remain.
         embeddings: (n, D) of each.
-        goal: which clip specifies the goal; it is no candidate.
+        thing: the goal's object.
         diverse: candidates of all objects, not of the goal's alone.
+        any_thing: the end of a clip of any object reaches the goal, as its action does, not of the goal's alone.
         same_context: x_0 of a candidate's own clip, else of another candidate clip drawn with `seed`.
+        left_out: the clip that specifies the goal, when it is one of these.
         seed: of that draw.
     """
-    pool = [i for i, clip in enumerate(clips) if i != goal and (diverse or clip.thing == clips[goal].thing)]
+    pool = [i for i, clip in enumerate(clips) if i != left_out and (diverse or clip.thing == thing)]
     contexts = np.arange(len(pool)) if same_context else others(len(pool), seed)
     lengths = [len(embeddings[i]) for i in pool]
     reached = [
-        (np.arange(n) >= n - max(1, round(GOAL_SHARE * n))) & (clips[i].thing == clips[goal].thing)
+        (np.arange(n) >= n - max(1, round(GOAL_SHARE * n))) & (any_thing or clips[i].thing == thing)
         for i, n in zip(pool, lengths, strict=True)
     ]
     starts = [embeddings[pool[context]][:1] for context in contexts]

@@ -1,4 +1,4 @@
-"""``zest select footage``: goal selection on real video."""
+"""``zest select footage``: goal and action selection on real video."""
 
 from __future__ import annotations
 
@@ -12,25 +12,26 @@ import tyro
 
 from zest_rl.cli.ui import Ui
 from zest_rl.errors import BadInput
-from zest_rl.scores import Features, Similarity
-
-FOOTAGE_VARIABLE = "ZEST_FOOTAGE"
+from zest_rl.scores import Features, Similarity, check_names
 
 
 @dataclass(frozen=True, kw_only=True)
 class FootageArguments:
-    """Goal selection on real video (Cui et al. §5.2): one clip specifies the goal by its first and last frame; do the
-    frames of other clips that score highest come from the end of a clip of the same object?
+    """Selection on real video (Cui et al. §5.2): one clip specifies the goal by its first and last frame; do the frames
+    of other clips that score highest come from the end of a clip?
     """
 
     what: ClassVar[str] = "footage"
-    folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="FOLDER")] = None
-    """Clips by object, FOLDER/OBJECT/CLIP.mp4 or FOLDER/OBJECT/CLIP/ with pictures; or Something-Something V2. Default:
-    the folder that the environment variable ZEST_FOOTAGE names."""
-    layout: Literal["by-object", "something-something"] = "by-object"
-    """How FOLDER is laid out."""
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER")]
+    """Clips of one action by object, FOLDER/OBJECT/CLIP.mp4 or FOLDER/OBJECT/CLIP/ with pictures, or laid out as
+    Something-Something V2. In a recipe, $NAME stands for an environment variable."""
+    goals: Path | None = None
+    """Folder of other clips, which specify the goals, for instance of rendered objects (the paper's sim2real); default
+    FOLDER's own clips in turn."""
+    ask: Literal["goals", "actions"] = "goals"
+    """goals: is the clip of the goal's object? actions: of any, as all do the same; takes --pool all."""
     template: str = "Opening [something]"
-    """With something-something: the action."""
+    """With Something-Something V2: the action."""
     pool: Literal["single", "all"] = "single"
     """Candidates of the goal's object alone (narrow), or of all objects (diverse)."""
     context: Literal["same", "different"] = "same"
@@ -54,6 +55,16 @@ class FootageArguments:
     device: str = "auto"
     """auto, cpu, cuda, cuda:1, …"""
 
+    def __post_init__(self) -> None:
+        check_names(self.features, self.similarity)
+        if min(self.top, self.n_repeats) < 1 or (self.max_clips is not None and self.max_clips < 3):
+            raise BadInput("--top and --n-repeats must be at least 1, and --max-clips at least 3")
+        if self.ask == "actions" and (self.pool, self.context) != ("all", "same"):
+            raise BadInput("actions are sought among all objects, each clip against its own start; give --pool all")
+        for folder in (self.folder, self.goals):
+            if folder is not None:
+                _located(folder)
+
 
 def run(config: FootageArguments, ui: Ui) -> dict[str, Any]:
     """Embed all clips, let clip after clip specify the goal, judge the highest scores."""
@@ -62,57 +73,63 @@ def run(config: FootageArguments, ui: Ui) -> dict[str, Any]:
     from zest_rl import footage, selection
     from zest_rl.embedders import load_embedder
     from zest_rl.metrics import bootstrap
-    from zest_rl.scores import check_names
 
-    folder = config.folder or _named_folder()
-    check_names(config.features, config.similarity)
-    if min(config.top, config.n_repeats) < 1 or (config.max_clips is not None and config.max_clips < 3):
-        raise BadInput("--top and --n-repeats must be at least 1, and --max-clips at least 3")
-    if config.layout == "by-object":
-        found = footage.folder_of_clips(folder)
-    else:
-        found = footage.something_something(folder, template=config.template)
-    things = footage.enough(found)
-    for thing in dict.fromkeys(clip.thing for clip in found if clip.thing not in things):
-        ui.warn(f"{thing!r} is left out: it has fewer than 3 clips, one for the goal and two to choose from")
+    folder, goal_folder = _located(config.folder), _located(config.goals or config.folder)
+    within = goal_folder.resolve() == folder.resolve()
+    found = footage.find_clips(folder, config.template)
+    goal_clips = found if within else footage.find_clips(goal_folder, config.template)
+    specified = {clip.thing for clip in goal_clips}
+    things = [thing for thing in footage.enough(found, 3 if within else 2) if thing in specified]
+    for thing in dict.fromkeys(clip.thing for clip in (*found, *goal_clips) if clip.thing not in things):
+        ui.warn(f"{thing!r} is left out: it needs 2 clips to choose from and 1 other that specifies the goal")
     if not things:
-        raise BadInput(f"no object in {folder} has the 3 clips that a selection takes")
-    by_thing = {thing: [clip for clip in found if clip.thing == thing][: config.max_clips] for thing in things}
-    clips = [clip for of_thing in by_thing.values() for clip in of_thing]
+        raise BadInput(f"no object has 2 clips in {folder} to choose from and 1 other in {goal_folder} for the goal")
+
+    def chosen(clips: list[footage.Clip]) -> list[footage.Clip]:
+        return [clip for thing in things for clip in [c for c in clips if c.thing == thing][: config.max_clips]]
+
+    clips = chosen(found)
+    goal_clips = clips if within else chosen(goal_clips)
     embedder = load_embedder(config.embedder, device=config.device, precision=config.precision)
-    with ui.progress("embedding clips", len(clips)) as advance:
+    with ui.progress("embedding clips", len(clips) if within else len(clips) + len(goal_clips)) as advance:
         embeddings = footage.embed_clips(clips, embedder, config.n_frames, on_done=advance)
+        goals = embeddings if within else footage.embed_clips(goal_clips, embedder, config.n_frames, on_done=advance)
     rows: dict[str, dict[str, Any]] = {}
     for thing in things:
-        own = [i for i, clip in enumerate(clips) if clip.thing == thing]
-        tops, ratios, picked = [], [], []
+        own = [i for i, clip in enumerate(goal_clips) if clip.thing == thing]
+        tops, variations, ratios, picked = [], [], [], []
         for repeat, goal in enumerate(np.random.default_rng(0).permutation(own)[: config.n_repeats].tolist()):
             pool = footage.candidates(
                 clips,
                 embeddings,
-                goal,
+                thing,
                 diverse=config.pool == "all",
+                any_thing=config.ask == "actions",
                 same_context=config.context == "same",
+                left_out=goal if within else None,
                 seed=repeat,
             )
-            scores = pool.scores(embeddings[goal][:1], embeddings[goal][-1:], config.features, config.similarity)
+            scores = pool.scores(goals[goal][:1], goals[goal][-1:], config.features, config.similarity)
             tops.append(selection.top_up_to(scores, pool.satisfies, config.top))
+            variations.append(selection.relative_variation(scores, pool.satisfies))
             ratios.append(selection.goal_frame_ratio(pool.satisfies))
             picked.append(min(config.top, int(pool.satisfies.sum())))
         rows[thing] = {
             "top_n_success": bootstrap([np.array(tops)]).as_json(),
+            "relative_variation": bootstrap([np.array(variations)]).as_json(),
             "goal_frame_ratio": float(np.mean(ratios)),
             "top": min(picked),
-            "n_clips": len(own),
+            "n_clips": sum(clip.thing == thing for clip in clips),
             "n_goals": len(tops),
         }
         if min(picked) < config.top:
             ui.warn(f"{thing!r}: only {min(picked)} frames reach the goal, so the highest {min(picked)} are judged")
     mean = float(np.mean([row["top_n_success"]["value"] for row in rows.values()]))
     chance = float(np.mean([row["goal_frame_ratio"] for row in rows.values()]))
+    paths = {"folder": str(folder), "goals": str(goal_folder)}
     return {
         "select": config.what,
-        "settings": {**asdict(config), "folder": str(folder), "embedder_sha256": embedder.fingerprint},
+        "settings": {**asdict(config), **paths, "embedder_sha256": embedder.fingerprint},
         "objects": rows,
         "mean": {"top_n_success": mean, "goal_frame_ratio": chance, "times_random": mean / chance},
         "n_clips": len(clips),
@@ -120,15 +137,12 @@ def run(config: FootageArguments, ui: Ui) -> dict[str, Any]:
     }
 
 
-def _named_folder() -> Path:
-    """Return the folder that the environment names; refuse when it names none."""
-    folder = os.environ.get(FOOTAGE_VARIABLE)
-    if not folder:
-        raise BadInput(
-            f"there is no folder of clips to select from: name it, zest select footage FOLDER, or set the environment "
-            f"variable {FOOTAGE_VARIABLE} to it"
-        )
-    return Path(folder)
+def _located(folder: Path) -> Path:
+    """Replace environment variables in the path; refuse those that are not set."""
+    path = os.path.expandvars(folder)
+    if path.startswith("$"):
+        raise BadInput(f"{path} names an environment variable that is not set; set it to a folder of clips")
+    return Path(path)
 
 
 def summary(result: dict[str, Any]) -> str:

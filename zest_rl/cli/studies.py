@@ -2,7 +2,7 @@
 
 A recipe has these tables (keys are the flags of the verb)::
 
-    study = "goals"                 or "actions": what `zest select` is asked
+    study = "goals"                 or "actions", "footage": what `zest select` is asked
     title = "…"
     caveats = ["…"]
     [collect], [tasks.NAME]         as in the recipes of `zest_rl.cli.plans`
@@ -12,19 +12,20 @@ A recipe has these tables (keys are the flags of the verb)::
     [paper."NAME"]                  a row of the paper to show beside ours: task → percent
 
 One cell is one setting on one task. What is rendered and embedded is kept, so a study that was cut short goes on there.
+With "footage" the tasks are the objects of its clips: nothing is collected, and pool is a flag of its own.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from zest_rl.cli.plans import located, plan_tasks, table_of
-from zest_rl.cli.ui import Ui
+from zest_rl.cli.ui import SilentUi, Ui
 from zest_rl.errors import BadInput, nearest
 from zest_rl.tasks import get_task
 
@@ -36,10 +37,10 @@ MEASURES = {"top_n_success": "Top-N success", "relative_variation": "total varia
 class Study:
     """The keys and tables of a study; what stands in a table is checked by the config of its verb."""
 
-    study: Literal["goals", "actions"]
+    study: Literal["goals", "actions", "footage"]
     title: str
-    collect: dict[str, Any]
     grid: dict[str, list[Any]]
+    collect: dict[str, Any] = field(default_factory=dict)
     caveats: tuple[str, ...] = ()
     tasks: dict[str, dict[str, Any]] = field(default_factory=dict)
     select: dict[str, Any] = field(default_factory=dict)
@@ -50,6 +51,8 @@ class Study:
             raise BadInput("grid needs at least 1 flag, and each flag at least 1 value")
         if not all(self.paper.values()):
             raise BadInput("paper: every row needs the figure of at least 1 task")
+        if bool(self.collect) == (self.study == "footage"):
+            raise BadInput("a study of goals or actions needs the table collect, one of footage takes none")
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,8 @@ class Setting:
 
     values: Mapping[str, Any]
     """Of the grid's flags."""
-    pool: Pool
+    pool: str
+    """Candidates, and what is asked of them: what the chance of success depends on."""
     select: Any
     """Arguments of `zest select`; datasets and task are added per cell."""
 
@@ -74,7 +78,7 @@ class StudyPlan:
 
     study: Study
     collect: Mapping[str, Any]
-    """Task → config of `zest collect`."""
+    """Task → config of `zest collect`; none for real video."""
     settings: tuple[Setting, ...]
 
 
@@ -90,22 +94,28 @@ def read_study(path: Path) -> StudyPlan:
 
     where = f"recipe {path}"
     study = load_config(Study, read_recipe(path), where)
-    collected = plan_tasks(study.collect, study.tasks, where)
+    real = study.study == "footage"
+    collected = {} if real else plan_tasks(study.collect, study.tasks, where)
     shared = table_of(study.select, f"{where} [select]", "datasets", "task")
     axes = table_of(study.grid, f"{where} [grid]", "datasets", "task")
     settings = []
     for values in product(*axes.values()):
         setting = dict(zip(axes, values, strict=True))
-        arguments = {**shared, **setting, "datasets": []}
-        pool = arguments.pop("pool", "single")
+        arguments = {**shared, **setting}
+        pool = arguments.get("pool", "single")
         if pool not in get_args(Pool):
             raise BadInput(f"{where} [grid]: unknown pool {pool!r}; {nearest(str(pool), get_args(Pool))}")
+        if real:
+            pool = ", ".join([pool, *(str(setting[key]) for key in ("ask", "folder") if key in setting)])
+        else:
+            arguments = {**arguments, "datasets": []}
+            arguments.pop("pool", None)
         settings.append(Setting(setting, pool, load_config(CONFIGS[study.study], arguments, f"{where} [grid]")))
         for config in collected.values():
             with located(f"{where} [grid]"):
                 goal_folder(settings[-1].select.goal, get_task(config.task))
     for name, row in study.paper.items():
-        for task in row.keys() - collected.keys():
+        for task in () if real else row.keys() - collected.keys():
             raise BadInput(f"{where} [paper.{name!r}]: there is no task {task!r} here; {nearest(task, collected)}")
     return StudyPlan(study, collected, tuple(settings))
 
@@ -113,8 +123,7 @@ def read_study(path: Path) -> StudyPlan:
 def run(path: Path, output: Path, ui: Ui, *, n_workers: int | None = None) -> dict[str, Any]:
     """Collect what is not there, select in every cell, and write result.json, table.md and report.html."""
     from zest_rl import artifacts
-    from zest_rl.cli import collect, select
-    from zest_rl.cli.ui import SilentUi
+    from zest_rl.cli import collect
     from zest_rl.report import write_report
 
     plan = read_study(path)
@@ -122,16 +131,11 @@ def run(path: Path, output: Path, ui: Ui, *, n_workers: int | None = None) -> di
     for task, config in plan.collect.items():
         ui.say(f"[1/2] collect {task}")
         datasets[task] = collect.run(replace(config, n_workers=n_workers), ui)["dataset"]
-    ui.say(f"[2/2] select {plan.study.study}: {len(plan.settings)} settings × {len(datasets)} tasks")
+    ui.say(f"[2/2] select {plan.study.study}: {len(plan.settings)} settings × {len(datasets) or 'all'} tasks")
     rows = []
-    with ui.progress("cells", len(plan.settings) * len(datasets)) as advance:
+    with ui.progress("cells", len(plan.settings) * max(1, len(datasets))) as advance:
         for setting in plan.settings:
-            cells = {}
-            for name, config in plan.collect.items():
-                pool = (datasets[name],) if setting.pool == "single" else tuple(datasets.values())
-                arguments = replace(setting.select, datasets=pool, task=config.task, n_workers=n_workers)
-                cells[name] = select.run(arguments, SilentUi())
-                advance()
+            cells = _select(plan, setting, datasets, n_workers, ui, advance)
             about = {"name": setting.name, "setting": dict(setting.values), "pool": setting.pool}
             rows.append({**about, "tasks": cells, "mean": _mean(cells)})
     result = {
@@ -140,7 +144,8 @@ def run(path: Path, output: Path, ui: Ui, *, n_workers: int | None = None) -> di
         "rows": rows,
         "paper": {name: {**row, "mean": sum(row.values()) / len(row)} for name, row in plan.study.paper.items()},
         "select": {
-            flag: value for flag, value in asdict(plan.settings[0].select).items()
+            flag: str(value) if isinstance(value, Path) else value
+            for flag, value in asdict(plan.settings[0].select).items()
             if value is not None and flag not in (*plan.settings[0].values, "datasets", "n_workers")
         },
         "provenance": artifacts.provenance(),
@@ -154,6 +159,29 @@ def run(path: Path, output: Path, ui: Ui, *, n_workers: int | None = None) -> di
         "result": str(output / "result.json"),
         "next": f"open {html} in a browser",
     }
+
+
+def _select(
+    plan: StudyPlan,
+    setting: Setting,
+    datasets: Mapping[str, str],
+    n_workers: int | None,
+    ui: Ui,
+    advance: Callable[[], object],
+) -> dict[str, Any]:
+    """Return what `zest select` finds, per task or per object of real video."""
+    from zest_rl.cli import select
+
+    cells: dict[str, Any] = {}
+    if not datasets:
+        cells = select.run(setting.select, ui)["objects"]
+        advance()
+    for name, dataset in datasets.items():
+        pool = (dataset,) if setting.pool == "single" else tuple(datasets.values())
+        arguments = replace(setting.select, datasets=pool, task=plan.collect[name].task, n_workers=n_workers)
+        cells[name] = select.run(arguments, SilentUi())
+        advance()
+    return cells
 
 
 def _mean(cells: Mapping[str, Mapping[str, Any]]) -> dict[str, float | None]:
@@ -175,16 +203,17 @@ def _mean(cells: Mapping[str, Mapping[str, Any]]) -> dict[str, float | None]:
 
 def _lines(result: Mapping[str, Any], measure: str) -> list[tuple[str, list[float | None], float]]:
     """Return (name, value per task, mean) of our rows, of chance, and of the paper."""
-    rows = result["rows"]
-    tasks = list(rows[0]["tasks"])
-    lines: list[tuple[str, list[float | None], float]] = [
-        (row["name"], [row["tasks"][task][measure]["value"] for task in tasks], row["mean"][measure]) for row in rows
-    ]
+    rows, tasks = result["rows"], _tasks(result)
+
+    def values(row: Mapping[str, Any], figure: Callable[[Any], float]) -> list[float | None]:
+        return [figure(row["tasks"][task]) if task in row["tasks"] else None for task in tasks]
+
+    lines = [(row["name"], values(row, lambda cell: cell[measure]["value"]), row["mean"][measure]) for row in rows]
     if measure != "top_n_success":
         return lines
     by_pool = {row["pool"]: row for row in rows}
     for pool, row in by_pool.items():
-        chance = [row["tasks"][task]["goal_frame_ratio"] for task in tasks]
+        chance = values(row, lambda cell: cell["goal_frame_ratio"])
         lines.append((f"at random, pool {pool}", chance, row["mean"]["goal_frame_ratio"]))
     for name, row in result["paper"].items():
         shares = [row[task] / 100 if task in row else None for task in tasks]
@@ -192,9 +221,14 @@ def _lines(result: Mapping[str, Any], measure: str) -> list[tuple[str, list[floa
     return lines
 
 
+def _tasks(result: Mapping[str, Any]) -> list[str]:
+    """Return the columns: all tasks, or all objects that any setting has."""
+    return list(dict.fromkeys(task for row in result["rows"] for task in row["tasks"]))
+
+
 def markdown(result: Mapping[str, Any]) -> str:
     """One table per measure, in percent: our rows, chance, and the paper's."""
-    tasks = list(result["rows"][0]["tasks"])
+    tasks = _tasks(result)
     parts = []
     for measure, title in MEASURES.items():
         parts += [f"{title}, %\n", f"| | {' | '.join(tasks)} | mean |", f"|---|{'---|' * (len(tasks) + 1)}"]
@@ -209,10 +243,11 @@ def study_report(result: Mapping[str, Any], caveats: tuple[str, ...]) -> Any:
     """Build the page: the same tables, with intervals."""
     from zest_rl.report import QualityRow, QualityTable, Report
 
-    tasks = list(result["rows"][0]["tasks"])
+    tasks = _tasks(result)
     intervals = {
-        (row["name"], task, measure): tuple(row["tasks"][task][measure]["ci95"])
-        for row, task, measure in product(result["rows"], tasks, MEASURES)
+        (row["name"], task, measure): tuple(cell[measure]["ci95"])
+        for row, measure in product(result["rows"], MEASURES)
+        for task, cell in row["tasks"].items()
     }
     unknown = (math.nan, math.nan)
     rows = [
