@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import os
 import shlex
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
 from zest_rl.cli.ui import Ui
 from zest_rl.errors import BadInput
 from zest_rl.scores import Features, Similarity, check_names
+
+if TYPE_CHECKING:
+    from zest_rl.footage import Frames
+    from zest_rl.types import FloatArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,9 +75,8 @@ def run(config: FootageArguments, ui: Ui) -> dict[str, Any]:
     """Embed all clips, let clip after clip specify the goal, judge the highest scores."""
     import numpy as np
 
-    from zest_rl import footage, selection
+    from zest_rl import footage
     from zest_rl.embedders import load_embedder
-    from zest_rl.metrics import bootstrap
 
     folder, goal_folder = _located(config.folder), _located(config.goals or config.folder)
     within = goal_folder.resolve() == folder.resolve()
@@ -97,9 +101,9 @@ def run(config: FootageArguments, ui: Ui) -> dict[str, Any]:
     rows: dict[str, dict[str, Any]] = {}
     for thing in things:
         own = [i for i, clip in enumerate(goal_clips) if clip.thing == thing]
-        tops, variations, ratios, picked = [], [], [], []
-        for repeat, goal in enumerate(np.random.default_rng(0).permutation(own)[: config.n_repeats].tolist()):
-            pool = footage.candidates(
+        drawn = np.random.default_rng(0).permutation(own)[: config.n_repeats].tolist()
+        pools = (
+            footage.candidates(
                 clips,
                 embeddings,
                 thing,
@@ -109,21 +113,14 @@ def run(config: FootageArguments, ui: Ui) -> dict[str, Any]:
                 left_out=goal if within else None,
                 seed=repeat,
             )
-            scores = pool.scores(goals[goal][:1], goals[goal][-1:], config.features, config.similarity)
-            tops.append(selection.top_up_to(scores, pool.satisfies, config.top))
-            variations.append(selection.relative_variation(scores, pool.satisfies))
-            ratios.append(selection.goal_frame_ratio(pool.satisfies))
-            picked.append(min(config.top, int(pool.satisfies.sum())))
-        rows[thing] = {
-            "top_n_success": bootstrap([np.array(tops)]).as_json(),
-            "relative_variation": bootstrap([np.array(variations)]).as_json(),
-            "goal_frame_ratio": float(np.mean(ratios)),
-            "top": min(picked),
-            "n_clips": sum(clip.thing == thing for clip in clips),
-            "n_goals": len(tops),
+            for repeat, goal in enumerate(drawn)
+        )
+        rows[thing] = _judge(config, pools, [goals[goal] for goal in drawn]) | {
+            "n_clips": sum(clip.thing == thing for clip in clips)
         }
-        if min(picked) < config.top:
-            ui.warn(f"{thing!r}: only {min(picked)} frames reach the goal, so the highest {min(picked)} are judged")
+        if rows[thing]["top"] < config.top:
+            n = rows[thing]["top"]
+            ui.warn(f"{thing!r}: only {n} frames reach the goal, so the highest {n} are judged")
     mean = float(np.mean([row["top_n_success"]["value"] for row in rows.values()]))
     chance = float(np.mean([row["goal_frame_ratio"] for row in rows.values()]))
     paths = {"folder": str(folder), "goals": str(goal_folder)}
@@ -134,6 +131,29 @@ def run(config: FootageArguments, ui: Ui) -> dict[str, Any]:
         "mean": {"top_n_success": mean, "goal_frame_ratio": chance, "times_random": mean / chance},
         "n_clips": len(clips),
         "next": f"zest select footage {shlex.quote(str(folder))} --pool all",
+    }
+
+
+def _judge(config: FootageArguments, pools: Iterable[Frames], goals: Sequence[FloatArray]) -> dict[str, Any]:
+    """Score each pool of candidates by the first and last of its goal's (n, D) embeddings; average the measures."""
+    import numpy as np
+
+    from zest_rl import selection
+    from zest_rl.metrics import bootstrap
+
+    tops, variations, ratios, picked = [], [], [], []
+    for pool, goal in zip(pools, goals, strict=True):
+        scores = pool.scores(goal[:1], goal[-1:], config.features, config.similarity)
+        tops.append(selection.top_up_to(scores, pool.satisfies, config.top))
+        variations.append(selection.relative_variation(scores, pool.satisfies))
+        ratios.append(selection.goal_frame_ratio(pool.satisfies))
+        picked.append(min(config.top, int(pool.satisfies.sum())))
+    return {
+        "top_n_success": bootstrap([np.array(tops)]).as_json(),
+        "relative_variation": bootstrap([np.array(variations)]).as_json(),
+        "goal_frame_ratio": float(np.mean(ratios)),
+        "top": min(picked),
+        "n_goals": len(tops),
     }
 
 
