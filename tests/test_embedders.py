@@ -180,6 +180,38 @@ def test_weights_trained_with_quick_gelu_run_with_quick_gelu(tmp_path: Path, fra
     np.testing.assert_allclose(embedder.embed_images(frames), expected, atol=1e-4)
 
 
+@pytest.mark.parametrize("torch_script", [True, False])
+def test_clip_as_openai_published_it_embeds_as_the_library_does(
+    clip_model: tuple[torch.nn.Module, Callable[[Image.Image], torch.Tensor]],
+    tmp_path: Path,
+    frames: list[np.ndarray],
+    torch_script: bool,
+) -> None:
+    """In half precision, with three sizes among the weights, for another activation than open_clip's default."""
+    preprocess = clip_model[1]
+    torch.manual_seed(0)
+    model = open_clip.create_model(OPEN_CLIP, force_quick_gelu=True)
+    for name, size in (("input_resolution", 224), ("context_length", 77), ("vocab_size", 49408)):
+        vars(model).pop(name, None)  # the library keeps some as plain numbers
+        model.register_buffer(name, torch.tensor(size))
+    file = tmp_path / "clip.pt"
+    if torch_script:
+        model.attn_mask = None  # it is built, not stored
+        pixels = {"encode_image": torch.zeros(1, 3, 224, 224)}
+        torch.jit.trace_module(model.eval(), pixels, check_trace=False).half().save(file)
+    else:
+        torch.save(model.half().state_dict(), file)
+    library = open_clip.load_openai_model(str(file), precision="fp32", device="cpu").eval()
+    embedder = load_embedder(f"open_clip:{OPEN_CLIP}@{file}", precision="fp32")
+    expected = by_library(library.encode_image, preprocess, frames)
+    np.testing.assert_allclose(embedder.embed_images(frames), expected, atol=1e-4)
+    with torch.inference_mode():
+        texts = library.encode_text(open_clip.get_tokenizer(OPEN_CLIP)(SENTENCES)).numpy()
+    np.testing.assert_allclose(embedder.embed_texts(SENTENCES), texts, atol=1e-4)
+    with pytest.raises(BadInput, match="does not hold exactly the weights of ViT-B-16"):
+        load_embedder(f"open_clip:ViT-B-16@{file}")
+
+
 def test_torchvision_embeds_as_the_library_does_before_its_classifier(tmp_path: Path, frames: list[np.ndarray]) -> None:
     torch.manual_seed(0)
     model = torchvision.models.resnet50().eval()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import urllib.error
 import urllib.request
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +22,8 @@ DEFAULT_EMBEDDER = "efficientnet-lite0"
 LITE0_PREPROCESSING: dict[str, Any] = {
     "input_size": (3, 224, 224), "crop_pct": 0.875, "interpolation": "bicubic", "mean": (0.5,) * 3, "std": (0.5,) * 3,
 }  # fmt: skip
+OPENAI_SIZES = ("input_resolution", "context_length", "vocab_size")
+"""What OpenAI's checkpoints of CLIP hold besides the weights, and nobody else's do."""
 _HUB_TIMEOUT = 5.0  # seconds; the hub libraries' own retries take up to a minute
 
 
@@ -72,7 +75,37 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         return dict(load_state_dict(str(path), weights_only=True))
 
 
-def fill(module: torch.nn.Module, state: dict[str, Any], path: Path, model: str, *, heads: tuple[str, ...]) -> None:
+def read_openai(path: Path) -> dict[str, Any] | None:
+    """Read a checkpoint that OpenAI published of CLIP, TorchScript or its state dict; None for one of another layout.
+
+    Raises:
+        BadInput: `path` is no file or no checkpoint.
+    """
+    import torch
+
+    with reading(path):
+        if path.suffix == ".safetensors":
+            return None
+        if _is_torch_script(path):
+            archive: torch.nn.Module = torch.jit.load(str(path), map_location="cpu")  # type: ignore[no-untyped-call]
+            state = archive.state_dict()
+        else:
+            state = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
+    if not set(OPENAI_SIZES) <= set(state):
+        return None
+    return {name: value for name, value in state.items() if name not in OPENAI_SIZES}
+
+
+def _is_torch_script(path: Path) -> bool:
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return any(name.endswith("/constants.pkl") for name in archive.namelist())
+
+
+def fill(
+    module: torch.nn.Module, state: dict[str, Any], path: Path, model: str, *, heads: tuple[str, ...] = ()
+) -> None:
     """Load `state` into `module`, all of it but the keys under `heads`: the classification heads that were cut off.
 
     Raises:

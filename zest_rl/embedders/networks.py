@@ -207,10 +207,16 @@ def _build_open_clip(uri: str, model: str, tag: str, path: Path | None) -> Netwo
         return encoded
 
     file = path or Path(checkpoints.fetch(uri, lambda: open_clip.download_pretrained(config)))
+    openai = checkpoints.read_openai(file)
+    if openai is not None:
+        config = {**config, "quick_gelu": True}
     with checkpoints.reading(file):
         module, _, preprocess = checkpoints.fetch(uri, create)  # a few text towers have their layout on a hub
-        keys = open_clip.load_checkpoint(module, str(file), strict=False, weights_only=True)
-        checkpoints.refuse_misfits(file, model, keys.missing_keys, keys.unexpected_keys)
+        if openai is None:
+            keys = open_clip.load_checkpoint(module, str(file), strict=False, weights_only=True)
+            checkpoints.refuse_misfits(file, model, keys.missing_keys, keys.unexpected_keys)
+        else:
+            checkpoints.fill(module, openai, file, model)
     return Network(module, preprocess, lambda pixels: module.encode_image(pixels, normalize=False), encode_texts)
 
 
