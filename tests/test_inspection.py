@@ -25,7 +25,7 @@ from zest_rl.scorer import ScorerConfig
 
 VIEWS = Views("micro", n_views=1, size=96, tolerance=0.05)
 CONFIG = ScorerConfig(VIEWS, "same-scene")
-NEEDS_TRUTH = {figure.name for figure in FIGURES if figure.needs_truth}
+NEEDS_TRUTH = {figure.name for figure in FIGURES if figure.needs == "truth"}
 
 
 @pytest.fixture
@@ -87,12 +87,13 @@ SCORES = [np.array([0.0, 0.5, 1.0], np.float32), np.array([0.0, 0.1, 0.2], np.fl
     [
         ("Contradictory", 0.02, "2% of the frames score otherwise than an equal frame"),
         ("Told by the step", 0.96, "the reward is a clock"),
+        ("Straight in time", 0.93, "nearly proportional to time"),
         ("Saturated", 0.96, "most progress is not rewarded"),
         ("Nothing to see", 0.95, "nothing moves, or the cameras do not see it"),
     ],
 )
 def test_each_degenerate_reward_has_its_warning(figure: str, value: float, expected: str) -> None:
-    figures = dict.fromkeys((figure.name for figure in FIGURES if not figure.needs_truth), FINE)
+    figures = dict.fromkeys((figure.name for figure in FIGURES if figure.needs != "truth"), FINE)
     assert warnings(SCORES, figures) == []
     (warning,) = warnings(SCORES, {**figures, figure: Estimate(value, value, value)})
     assert expected in warning
@@ -114,8 +115,11 @@ def test_returns_that_do_not_rank_the_episodes_are_warned_of(rho: Estimate, expe
 
 
 def test_constant_scores_and_constant_returns_are_warned_of() -> None:
-    figures = dict.fromkeys((figure.name for figure in FIGURES if not figure.needs_truth), FINE)
+    figures = dict.fromkeys((figure.name for figure in FIGURES if figure.needs != "truth"), FINE)
     assert "tell nothing apart" in warnings([np.ones(3, np.float32)] * 3, figures)[0]
+    nearly = [np.float32(0.7) + np.float32(1e-6) * score for score in SCORES]
+    assert "tell nothing apart" in warnings(nearly, figures)[0]
+    assert warnings([np.float32(1e-6) * score for score in SCORES], figures) == [], "small is not constant"
     alike = [np.array([0.0, 1.0], np.float32), np.array([1.0, 0.0], np.float32)]
     assert "same return" in warnings(alike, figures)[0]
 
@@ -184,6 +188,8 @@ def test_each_goal_scores_the_ends_of_all_tasks_as_their_own_views_show_them(
         assert means[i, i] > means[1 - i, i], "an open door looks more like itself than like another one"
         assert means[1 - i, i] != 0, "something is seen to change"
     assert confusion_warnings(inspections, compared) == {}
+    assert (compared.low <= means).all()
+    assert (means <= compared.high).all()
     found = confusion_warnings(inspections, replace(compared, means=means[::-1]))
     assert set(found) == {*of_two_tasks, scored}
     assert "the episodes of sdoor higher" in found[of_two_tasks[0]]
@@ -195,11 +201,15 @@ def test_a_goal_that_scores_another_task_higher_is_told_though_a_sibling_scores_
     inspections = [inspect(dataset) for dataset in of_two_tasks]
     a, b, c = ("zest/a-v0", "1" * 64), ("zest/b-v0", "2" * 64), ("zest/c-v0", "3" * 64)
     means = np.array([[0.3, 0.1], [0.9, 0.1], [0.5, 0.8]], np.float32)
-    found = Confusion({a: "micro", b: "micro", c: "sdoor"}, (0, 2), means)
+    found = Confusion({a: "micro", b: "micro", c: "sdoor"}, (0, 2), means, means - 0.01, means + 0.01)
     assert confusion_warnings(inspections, found) == {
         of_two_tasks[0]: "Its goal scores the episodes of sdoor higher (0.50) than its own (0.30)."
     }
     assert found.row_names() == ("micro (zest/a-v0)", "micro (zest/b-v0)", "sdoor")
+    alike = np.full((3, 2), 0.8, np.float32)
+    told = confusion_warnings(inspections, replace(found, means=alike, low=alike - 0.01, high=alike + 0.01))
+    assert set(told) == set(of_two_tasks)
+    assert "every task alike (0.80 to 0.80)" in told[of_two_tasks[0]]
     again = replace(found, sources={a: "micro", (a[0], b[1]): "micro", c: "sdoor"})
     assert again.row_names() == ("micro (zest/a-v0, 11111111)", "micro (zest/a-v0, 22222222)", "sdoor")
 
@@ -219,6 +229,8 @@ def test_the_page_shows_tasks_against_goals_and_does_without_where_scorers_are_o
     page = (tmp_path / "page.html").read_text()
     assert "<h2>Tasks against goals</h2>" in page
     assert f"<b>{matrix[1][1]:.2f}</b>" in page
+    low, high = found["ci95"][1][1]
+    assert low <= matrix[1][1] <= high
     monkeypatch.setattr(rendering, "_RENDERER_VERSION", -1)
     assert zest(*words)["goals_against_tasks"] is None
     assert "<h2>Frames</h2>" not in (tmp_path / "page.html").read_text()

@@ -141,8 +141,16 @@ def test_saturation_counts_both_ends() -> None:
 
 
 def test_frames_equal_to_the_first_show_nothing() -> None:
-    states = np.array([[0.0], [0.0], [0.0], [1.0], [0.0]])
-    assert quality.share_still([states] * 3).value == pytest.approx(3 / 4)
+    still = np.array([True, True, False, True])
+    assert quality.share_still([still, still[:2]]).value == pytest.approx((3 / 4 + 1) / 2)
+
+
+def test_a_score_proportional_to_time_is_straight_whatever_its_slope_start_and_length() -> None:
+    lines = [slope * np.arange(n) + start for slope, n, start in ((0.1, 10, 0.0), (1.0, 30, 5.0), (-0.3, 7, 1.0))]
+    assert quality.straight_in_time([line.astype(np.float32) for line in lines]).value == pytest.approx(1)
+    step = (np.arange(30) >= 15).astype(np.float32)
+    assert quality.straight_in_time([step]).value == pytest.approx(np.corrcoef(step, np.arange(30))[0, 1] ** 2)
+    assert quality.straight_in_time([np.ones(5, np.float32), np.ones(1, np.float32)]).value == 0
 
 
 def test_an_undefined_figure_is_nan_and_not_a_number_that_looks_good() -> None:
@@ -171,7 +179,8 @@ def test_every_interval_holds_its_value() -> None:
             quality.share_told_by_step(mixed),
             quality.share_told_by_step([score + 0.1 * RISING for score in mixed]),
             quality.share_saturated(mixed),
-            quality.share_still(states),
+            quality.share_still([episode > 0 for episode in mixed]),
+            quality.straight_in_time(mixed),
             quality.share_contradictory(mixed, states),
             quality.kendall(returns, true_returns),
             quality.pairwise_accuracy(returns, true_returns),

@@ -66,6 +66,7 @@ def report(video: Path) -> Report:
     steps = np.arange(0, 500, 100, dtype=np.float32)
     image = rng.integers(0, 255, (240, 320, 3), dtype=np.uint8)
     episode = EpisodePanel("an episode", "ZeST+DT", 7, 93.21, True, video, FPS, progress, scores)
+    means = np.array([[0.61, 0.2, 0.3], [0.1, 0.43, 0.09]], np.float32)
     return Report(
         title="Microwave",
         summary_sentence="The reward ranks episodes.",
@@ -91,7 +92,7 @@ def report(video: Path) -> Report:
             ),
         ),
         matrix=Matrix(
-            ("door", "knob"), ("delta", "raw", "text"), np.array([[0.61, 0.2, 0.3], [0.1, 0.43, 0.09]], np.float32)
+            ("door", "knob"), ("delta", "raw", "text"), means, means - np.float32(0.02), means + np.float32(0.03)
         ),
         strips=(Strip("the best", (image, image), (0, 30), np.array([0.0, 1.2], np.float32)),),
         views=(Curve("all views", "score", steps, steps), Curve("view 1", "score", steps, 2 * steps)),
@@ -123,10 +124,24 @@ def test_a_matrix_has_a_row_per_task_and_the_highest_of_each_goal_in_bold(report
     (table,) = re.findall(r"<table>(?:(?!</table>).)*by the goal of.*?</table>", render_html(report), re.DOTALL)
     assert re.findall(r'<th scope="col" class="num">(.*?)</th>', table) == ["delta", "raw", "text"]
     rows = re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', table)
-    shown = [(name, re.findall(r'data-label="(.*?)">(.*?)</td>', cells)) for name, cells in rows]
-    assert shown == [
-        ("door", [("delta", "<b>0.61</b>"), ("raw", "0.20"), ("text", "<b>0.30</b>")]),
-        ("knob", [("delta", "0.10"), ("raw", "<b>0.43</b>"), ("text", "0.09")]),
+    cell = r'data-label="(.*?)">(.*?)<span class="note">(.*?)</span></td>'
+    assert [(name, re.findall(cell, cells)) for name, cells in rows] == [
+        (
+            "door",
+            [
+                ("delta", "<b>0.61</b>", "0.59 to 0.64"),
+                ("raw", "0.20", "0.18 to 0.23"),
+                ("text", "<b>0.30</b>", "0.28 to 0.33"),
+            ],
+        ),
+        (
+            "knob",
+            [
+                ("delta", "0.10", "0.08 to 0.13"),
+                ("raw", "<b>0.43</b>", "0.41 to 0.46"),
+                ("text", "0.09", "0.07 to 0.12"),
+            ],
+        ),
     ]
 
 
@@ -187,7 +202,7 @@ def test_figures_that_are_not_finite_are_shown_as_a_dash(report: Report) -> None
         curves=(Curve("BC", "loss", np.zeros(2, np.float32), np.full(2, nan, np.float32)),),
         details={"config": {"target": nan, "limits": [inf, np.float32("nan")], "array": np.array([nan])}},
         quality=QualityTable(("d",), (QualityRow("q", "m", ((nan, nan, inf),)),)),
-        matrix=Matrix(("d",), ("d",), np.full((1, 1), nan, np.float32)),
+        matrix=Matrix(("d",), ("d",), *np.full((3, 1, 1), nan, np.float32)),
         strips=(dataclasses.replace(report.strips[0], scores=np.array([nan, inf], np.float32)),),
     )
     html = render_html(broken)
@@ -242,7 +257,7 @@ def test_parts_that_do_not_fit_together_are_refused(report: Report) -> None:
     with pytest.raises(BadInput, match="got zest_returns 3, gt_returns 4"):
         Scatter("s", three, four, 0.0)
     with pytest.raises(BadInput, match=r"2 sources and 1 goals must have shape \(2, 1\), got \(1, 2\)"):
-        Matrix(("door", "knob"), ("delta",), np.zeros((1, 2), np.float32))
+        Matrix(("door", "knob"), ("delta",), *np.zeros((3, 1, 2), np.float32))
     with pytest.raises(BadInput, match="needs both low and high"):
         Curve("BC", "loss", three, three, low=three)
     with pytest.raises(BadInput, match=r"unknown kind 'metod'; did you mean 'method'"):

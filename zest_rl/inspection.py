@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,10 @@ from zest_rl.metrics import Estimate
 from zest_rl.panels import MIN_EPISODES_TO_RANK
 from zest_rl.types import FloatArray, GroundTruth
 
-CLOCK, SATURATED, STILL, CONTRADICTORY = 0.95, 0.95, 0.9, 0.01
+CLOCK, STRAIGHT, SATURATED, STILL, CONTRADICTORY = 0.95, 0.9, 0.95, 0.9, 0.01
 """From these shares on a warning is given."""
+FLAT = 1e-3
+"""Scores whose range is at most this share of the largest are constant, whatever rounding makes of them."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +29,9 @@ class Figure:
 
     name: str
     meaning: str
-    needs_truth: bool
+    needs: Literal["scores", "truth", "states", "still"]
+    """What of `_Rewards` must be known."""
     measure: Callable[[_Rewards], Estimate]
-    needs_states: bool = False
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,8 @@ class _Rewards:
     """(T,) per episode, of the frames after each action; the rewards, unless these are differences."""
     states: list[NDArray[np.float64]] | None
     """(T+1, nq) per episode, rounded as the frames were rendered; None of other robots than the kitchen's."""
+    still: list[NDArray[np.bool_]] | None
+    """(T,) per episode, frames that show what the first one shows; None where that is not known."""
     truth: list[GroundTruth] | None
 
     @cached_property
@@ -66,75 +70,85 @@ class _Rewards:
         assert self.states is not None
         return self.states
 
+    @property
+    def known_still(self) -> list[NDArray[np.bool_]]:
+        """Which frames are still, which is known."""
+        assert self.still is not None
+        return self.still
+
 
 FIGURES = (
     Figure(
         "Spearman ρ",
         "rank correlation of the episodes' returns with the true ones; 1 is best",
-        True,
+        "truth",
         lambda r: metrics.spearman(r.returns, r.true_returns),
     ),
     Figure(
         "Kendall τ-b",
         "the same by pairs; 1 is best",
-        True,
+        "truth",
         lambda r: quality.kendall(r.returns, r.true_returns),
     ),
     Figure(
         "Pairwise accuracy",
         "share of pairs of episodes that are ordered rightly; .5 is chance",
-        True,
+        "truth",
         lambda r: quality.pairwise_accuracy(r.returns, r.true_returns),
     ),
     Figure(
         "AUPRC of success",
         "how well the return tells successes; chance is their share, which is the next line",
-        True,
+        "truth",
         lambda r: quality.average_precision(r.returns, np.array([e.success for e in r.known_truth])),
     ),
     Figure(
         "Share of successes",
         "in the dataset",
-        True,
+        "truth",
         lambda r: metrics.wilson(sum(e.success for e in r.known_truth), len(r.known_truth)),
     ),
     Figure(
         "EPIC distance",
         "of levels to the true reward, step by step; 0 is the same up to scale and offset, .71 unrelated",
-        True,
+        "truth",
         lambda r: quality.epic_distance(r.scores, [e.rewards for e in r.known_truth]),
     ),
     Figure(
         "Value-order correlation",
         "of reward and time within an episode; 1 rises at every step",
-        False,
+        "scores",
         lambda r: quality.value_order(r.rewards),
     ),
     Figure(
         "Told by the step",
         "share of the rewards' variance that the number of the step tells; 1 is a clock",
-        False,
+        "scores",
         lambda r: quality.share_told_by_step(r.rewards),
+    ),
+    Figure(
+        "Straight in time",
+        "share of the score's variance within an episode that a straight line in time tells; 1 is proportional to time",
+        "scores",
+        lambda r: quality.straight_in_time(r.scores),
     ),
     Figure(
         "Saturated",
         "share of rewards next to the lowest or the highest",
-        False,
+        "scores",
         lambda r: quality.share_saturated(r.rewards),
     ),
     Figure(
         "Nothing to see",
         "share of frames that show what the first one shows",
-        False,
-        lambda r: quality.share_still(r.known_states),
-        needs_states=True,
+        "still",
+        lambda r: quality.share_still(r.known_still),
     ),
     Figure(
         "Contradictory",
         "share of frames that score otherwise than an equal one of the same episode; 0 is right",
-        False,
+        "states",
         lambda r: quality.share_contradictory(r.scores, [episode[1:] for episode in r.known_states]),
-        needs_states=True,
     ),
 )
 
@@ -178,24 +192,23 @@ def inspect(dataset_id: str) -> Inspection:
     made = metadata.get("zest", {}).get("relabel")
     if made is None:
         raise BadInput(f"dataset {dataset_id} holds no ZeST scores; run `zest relabel {dataset_id}` and inspect that")
-    views = None if data.is_foreign(metadata) else Views(**made["scorer"]["config"]["views"])
+    config = made["scorer"]["config"]
+    views = None if data.is_foreign(metadata) else Views(**config["views"])
     step_rewards = [episode.rewards for episode in data.read_episodes(dataset_id)]
     if len(step_rewards) < MIN_EPISODES_TO_RANK:
         raise BadInput(
             f"rewards can be judged on at least {MIN_EPISODES_TO_RANK} episodes, {dataset_id} has {len(step_rewards)}"
         )
-    rewards = _Rewards(
-        step_rewards,
-        [score[1:] for score in data.read_scores(dataset_id)],
-        None if views is None else [canonical_states(states, views) for states in data.read_states(dataset_id)],
-        data.read_ground_truth(dataset_id) if data.has_ground_truth(dataset_id) else None,
-    )
-    figures = {
-        figure.name: figure.measure(rewards)
-        for figure in FIGURES
-        if (rewards.truth is not None or not figure.needs_truth)
-        and (rewards.states is not None or not figure.needs_states)
-    }
+    scores = [score[1:] for score in data.read_scores(dataset_id)]
+    states, still = None, None
+    if views is not None:
+        states = [canonical_states(episode, views) for episode in data.read_states(dataset_id)]
+        still = [(episode[1:] == episode[0]).all(axis=1) for episode in states]
+    elif (config["features"], config["similarity"]) == ("delta", "cos") and made["shuffle"] is None:
+        still = [score == 0 for score in scores]  # nothing else scores exactly 0
+    truth = data.read_ground_truth(dataset_id) if data.has_ground_truth(dataset_id) else None
+    rewards = _Rewards(step_rewards, scores, states, still, truth)
+    figures = {figure.name: figure.measure(rewards) for figure in FIGURES if getattr(rewards, figure.needs) is not None}
     found = warnings(step_rewards, figures)
     if made["shuffle"] is not None:
         found.insert(0, "These are the scores of other episodes: the dataset was relabeled with --shuffle.")
@@ -218,7 +231,8 @@ def warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimate]) -> 
         rewards: (T,) per episode.
         figures: by the names of `FIGURES`.
     """
-    if np.ptp(np.concatenate(rewards)) == 0:
+    every = np.concatenate(rewards)
+    if np.ptp(every) <= FLAT * np.abs(every).max():
         return ["All frames score the same: this goal and embedder tell nothing apart. Look at the goal's pictures."]
     found = []
     if np.ptp(quality.returns_of(rewards)) == 0:
@@ -230,6 +244,11 @@ def warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimate]) -> 
         )
     if figures["Told by the step"].value >= CLOCK:
         found.append("The number of the step alone tells the score: the reward is a clock, whatever the robot does.")
+    elif figures["Straight in time"].value >= STRAIGHT:
+        found.append(
+            "In every episode, good or bad, the score is nearly proportional to time: it may tell how long the robot "
+            "has moved rather than how near the goal is."
+        )
     if figures["Saturated"].value >= SATURATED:
         found.append("Nearly all frames score next to the lowest or the highest: most progress is not rewarded.")
     if "Nothing to see" in figures and figures["Nothing to see"].value >= STILL:

@@ -12,7 +12,7 @@ import numpy as np
 from zest_rl import data
 from zest_rl.inspection import FIGURES, Inspection
 from zest_rl.looks import Look
-from zest_rl.metrics import Estimate, spearman
+from zest_rl.metrics import Estimate, bootstrap, spearman
 from zest_rl.panels import MIN_EPISODES_TO_RANK, goal_panel
 from zest_rl.relabel import SCORER_FILE
 from zest_rl.report import Curve, Matrix, QualityRow, QualityTable, Report, Scatter, Strip
@@ -63,6 +63,10 @@ class Confusion:
     """The row of each dataset's own episodes."""
     means: FloatArray
     """Mean score (n_sources, n_datasets) float32."""
+    low: FloatArray
+    """Lower ends of their 95 % bootstrap intervals over episodes, of the same shape."""
+    high: FloatArray
+    """Upper ends."""
 
     def row_names(self) -> tuple[str, ...]:
         """Name each row by its task; sources of the same task by their ids, too, and if need be by their hashes."""
@@ -91,15 +95,17 @@ def confusion(
     """
     seen = {_source(one): one for one in inspections}
     ends = [np.stack([e[[0, -1]] for e in data.read_states(one.dataset_id)], axis=1) for one in seen.values()]
-    means = np.empty((len(seen), len(inspections)), dtype=np.float32)
+    found = np.empty((3, len(seen), len(inspections)), dtype=np.float32)
     for column, goal_of in enumerate(inspections):
         goal = Scorer.load(data.dataset_path(goal_of.dataset_id) / SCORER_FILE, n_workers=n_workers)
         for row, ((first, last), shown) in enumerate(zip(ends, seen.values(), strict=True)):
-            means[row, column] = goal.seen_as(shown.task).score_pairs(first, last).mean()
+            scores = goal.seen_as(shown.task).score_pairs(first, last).astype(np.float64)
+            mean = bootstrap([scores], n_resamples=1000)
+            found[:, row, column] = mean.value, mean.low, mean.high
         on_done()
     rows = list(seen)
     own = tuple(rows.index(_source(one)) for one in inspections)
-    return Confusion({source: one.task for source, one in seen.items()}, own, means)
+    return Confusion({source: one.task for source, one in seen.items()}, own, *found)
 
 
 def _source(inspection: Inspection) -> tuple[str, str]:
@@ -107,14 +113,21 @@ def _source(inspection: Inspection) -> tuple[str, str]:
 
 
 def confusion_warnings(inspections: Sequence[Inspection], found: Confusion) -> dict[str, str]:
-    """Find the goals that score the episodes of another task higher than those of their own: dataset → sentence."""
+    """Find the goals that score another task's episodes higher than their own, or all alike: dataset → sentence."""
     tasks, warnings = list(found.sources.values()), {}
-    for goal_of, own, means in zip(inspections, found.own, found.means.T, strict=True):
-        best = max((row for row, task in enumerate(tasks) if task != goal_of.task), key=means.__getitem__)
+    for column, (goal_of, own) in enumerate(zip(inspections, found.own, strict=True)):
+        means, low, high = found.means[:, column], found.low[:, column], found.high[:, column]
+        others = [row for row, task in enumerate(tasks) if task != goal_of.task]
+        best = max(others, key=means.__getitem__)
         if means[best] > means[own]:
             warnings[goal_of.dataset_id] = (
                 f"Its goal scores the episodes of {found.row_names()[best]} higher ({means[best]:.2f}) than its own "
                 f"({means[own]:.2f})."
+            )
+        elif (high[others] >= low[own]).all():
+            warnings[goal_of.dataset_id] = (
+                f"Its goal scores the episodes of every task alike ({means.min():.2f} to {means.max():.2f}): it does "
+                "not tell its own from the others."
             )
     return warnings
 
@@ -208,7 +221,9 @@ def inspection_report(
         summary_sentence=f"Datasets: {len(names)}, warnings: {n_warnings}. Nothing was trained.",
         warnings=tuple(f"{dataset}: {sentence}" for dataset, found in warnings.items() for sentence in found),
         quality=QualityTable(names, tuple(rows)),
-        matrix=None if compared is None else Matrix(compared.row_names(), names, compared.means),
+        matrix=None
+        if compared is None
+        else Matrix(compared.row_names(), names, compared.means, compared.low, compared.high),
         goals=tuple(
             goal_panel(name, one.dataset_id, scatter)
             for name, one, scatter in zip(names, inspections, scatters, strict=True)

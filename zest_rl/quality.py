@@ -89,6 +89,18 @@ def share_told_by_step(scores: Sequence[FloatArray]) -> Estimate:
     return over_episodes(share, len(scores))
 
 
+def straight_in_time(scores: Sequence[FloatArray]) -> Estimate:
+    """Share of an episode's variance that a straight line in time tells, averaged over episodes. No ground truth.
+
+    Pearson's ρ² of score and step. Episodes whose scores are constant, or that have one step, count as 0.
+    """
+    _each_with("scores", scores, scores)
+    shares = np.array(
+        [0.0 if np.ptp(score) == 0 else np.corrcoef(score, np.arange(len(score)))[0, 1] ** 2 for score in scores]
+    )
+    return over_episodes(lambda i: float(shares[i].mean()), len(shares))
+
+
 def share_saturated(scores: Sequence[FloatArray]) -> Estimate:
     """Share of frames that score within `SATURATED_BAND` of the dataset's lowest or highest score. No ground truth.
 
@@ -104,13 +116,13 @@ def share_saturated(scores: Sequence[FloatArray]) -> Estimate:
     return _mean_over_frames(shares, scores)
 
 
-def share_still(states: Sequence[NDArray[np.float64]]) -> Estimate:
-    """Share of frames after the first whose state (T+1, nq) equals that of the first: nothing to be seen there yet.
+def share_still(still: Sequence[NDArray[np.bool_]]) -> Estimate:
+    """Share of the frames after the first (T,) that show what the first one shows: nothing to be seen there yet.
 
     Averaged over episodes. No ground truth.
     """
-    still = np.array([(episode[1:] == episode[0]).all(axis=1).mean() for episode in states])
-    return over_episodes(lambda i: float(still[i].mean()), len(still))
+    shares = np.array([episode.mean() for episode in still])
+    return over_episodes(lambda i: float(shares[i].mean()), len(shares))
 
 
 def share_contradictory(scores: Sequence[FloatArray], states: Sequence[NDArray[np.float64]]) -> Estimate:

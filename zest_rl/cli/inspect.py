@@ -28,6 +28,8 @@ class Config:
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Measure, warn, write the page."""
+    import numpy as np
+
     from zest_rl.errors import BadInput, ZestError
     from zest_rl.inspection import inspect
     from zest_rl.inspection_page import confusion, confusion_warnings, inspection_report, labels, look_at
@@ -82,6 +84,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
             "episodes_of": [source for source, _ in compared.sources],
             "by_goal_of": list(ids),
             "mean_scores": compared.means.tolist(),
+            "ci95": np.stack([compared.low, compared.high], axis=-1).tolist(),
         },
         "report": str(page),
         "next": f"open {page} in a browser",

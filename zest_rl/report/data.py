@@ -215,13 +215,18 @@ class Matrix:
     goals: tuple[str, ...]
     values: FloatArray
     """(n_episodes, n_goals) float32."""
+    low: FloatArray
+    """Lower ends of their 95 % intervals, of the same shape."""
+    high: FloatArray
+    """Upper ends."""
 
     def __post_init__(self) -> None:
         shape = (len(self.episodes), len(self.goals))
-        if self.values.shape != shape:
-            raise BadInput(
-                f"a matrix of {shape[0]} sources and {shape[1]} goals must have shape {shape}, got {self.values.shape}"
-            )
+        for values in (self.values, self.low, self.high):
+            if values.shape != shape:
+                raise BadInput(
+                    f"a matrix of {shape[0]} sources and {shape[1]} goals must have shape {shape}, got {values.shape}"
+                )
 
 
 @dataclass(frozen=True)

@@ -242,6 +242,7 @@ def _matrix(matrix: Matrix) -> str:
         cells = "".join(
             f'<td class="num" data-label="{escape(goal)}">'
             + (f"<b>{number(float(value))}</b>" if highest[j] == i else number(float(value)))
+            + _note(_between(float(matrix.low[i, j]), float(matrix.high[i, j]), 2))
             + "</td>"
             for j, (goal, value) in enumerate(zip(matrix.goals, values, strict=True))
         )
