@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from zest_rl.cli.studies import markdown, read_study
@@ -61,7 +62,9 @@ def test_a_study_selects_in_every_cell_and_puts_the_paper_beside(
     assert result["rows"][1]["tasks"]["micro"] == alone
     assert result["rows"][1]["mean"]["top_n_success"] == alone["top_n_success"]["value"]
     assert result["rows"][3]["tasks"] == result["rows"][1]["tasks"], "of one task, all tasks are the single one"
-    assert result["paper"] == {"SGSD, CLIP": {"micro": 92.0, "mean": 92.0}}
+    assert result["paper"] == {"SGSD, CLIP": {"micro": 92.0}}
+    assert alone["n_repeats"] == 1, "nothing was drawn"
+    assert result["rows"][1]["mean"]["top_n_standard_error_of_repeats"] is None
     assert json.loads((tmp_path / "out" / "result.json").read_text())["rows"] == result["rows"]
     table = (tmp_path / "out" / "table.md").read_text()
     assert table == markdown(result)
@@ -71,6 +74,37 @@ def test_a_study_selects_in_every_cell_and_puts_the_paper_beside(
     for part in ("A tiny study", "paper: SGSD, CLIP", "at random, pool all", "Tiny."):
         assert part in page
     assert zest(*words)["rows"] == result["rows"]
+
+
+def test_the_mean_of_repeats_has_a_standard_error_over_them(
+    tmp_path: Path, zest: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
+    drawn = RECIPE.replace("top = 3", "top = 3\nn_goals = 1\nn_repeats = 3").replace('"same-scene", ', "")
+    result = zest("reproduce", write(tmp_path, drawn), "--output", tmp_path / "out", "--n-workers", "1")
+    row = result["rows"][0]
+    by_repeat = row["tasks"]["micro"]["top_n_by_repeat"]
+    assert len(by_repeat) == row["tasks"]["micro"]["n_repeats"] == 3
+    assert row["mean"]["top_n_success"] == pytest.approx(np.mean(by_repeat))
+    error = np.std(by_repeat, ddof=1) / np.sqrt(3)
+    assert row["mean"]["top_n_standard_error_of_repeats"] == pytest.approx(error)
+    assert f"± {100 * error:.1f} |" in (tmp_path / "out" / "table.md").read_text()
+
+
+def test_the_papers_mean_is_over_the_columns_that_are_shown() -> None:
+    cell = {"top_n_success": {"value": 0.5}, "relative_variation": {"value": 0.5}, "goal_frame_ratio": 0.1}
+    mean = {"top_n_success": 0.5, "relative_variation": 0.5, "goal_frame_ratio": 0.1}
+    row = {
+        "name": "a",
+        "pool": "single",
+        "tasks": {"oven": cell},
+        "mean": mean | {"top_n_standard_error_of_repeats": None},
+    }
+    result = {"rows": [row], "paper": {"here": {"oven": 40.0, "door": 90.0}, "elsewhere": {"door": 90.0}}}
+    table = markdown(result)
+    assert "| paper: here | 40.0 | 40.0 |" in table
+    assert "elsewhere" not in table
 
 
 @pytest.mark.parametrize(

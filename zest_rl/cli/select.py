@@ -139,6 +139,8 @@ def run(config: Arguments | select_footage.FootageArguments, ui: Ui) -> dict[str
         "task": task.name,
         "goal": config.goal,
         "top": config.top,
+        "n_repeats": len(scores),
+        "top_n_by_repeat": [selection.top_up_to(row, satisfies, config.top) for row in scores],
         **{name: one.as_json() for name, one in found.items()},
         "goal_frame_ratio": chance,
         "times_random": found["top_n_success"].value / chance,

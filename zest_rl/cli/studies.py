@@ -18,7 +18,8 @@ With "footage" the tasks are the objects of its clips: nothing is collected, and
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+import statistics
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -142,11 +143,11 @@ def run(path: Path, output: Path, ui: Ui, *, n_workers: int | None = None) -> di
         "study": plan.study.study,
         "title": plan.study.title,
         "rows": rows,
-        "paper": {name: {**row, "mean": sum(row.values()) / len(row)} for name, row in plan.study.paper.items()},
+        "paper": plan.study.paper,
         "select": {
             flag: str(value) if isinstance(value, Path) else value
             for flag, value in asdict(plan.settings[0].select).items()
-            if value is not None and flag not in (*plan.settings[0].values, "datasets", "n_workers")
+            if value is not None and flag not in (*plan.settings[0].values, "datasets", "n_workers", "n_repeats")
         },
         "provenance": artifacts.provenance(),
     }  # fmt: skip
@@ -185,20 +186,25 @@ def _select(
 
 
 def _mean(cells: Mapping[str, Mapping[str, Any]]) -> dict[str, float | None]:
-    """Mean over tasks of every figure, and the standard error of the Top-N success over tasks, as the paper has it."""
+    """Mean over tasks of every figure; the standard error of the Top-N success over tasks, as the paper has it, and of
+    its mean over tasks over the repeats, where goals or contexts were drawn anew.
+    """
     top = [cell["top_n_success"]["value"] for cell in cells.values()]
     mean = sum(top) / len(top)
-    error = None
-    if len(top) > 1:
-        error = math.sqrt(sum((value - mean) ** 2 for value in top) / (len(top) - 1) / len(top))
+    repeats = list(zip(*(cell.get("top_n_by_repeat", []) for cell in cells.values()), strict=False))
     ratio = sum(cell["goal_frame_ratio"] for cell in cells.values()) / len(cells)
     return {
         "top_n_success": mean,
-        "top_n_standard_error": error,
+        "top_n_standard_error": _standard_error(top),
+        "top_n_standard_error_of_repeats": _standard_error([sum(repeat) / len(repeat) for repeat in repeats]),
         "relative_variation": sum(cell["relative_variation"]["value"] for cell in cells.values()) / len(cells),
         "goal_frame_ratio": ratio,
         "times_random": mean / ratio,
     }
+
+
+def _standard_error(values: Sequence[float]) -> float | None:
+    return statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else None
 
 
 def _lines(result: Mapping[str, Any], measure: str) -> list[tuple[str, list[float | None], float]]:
@@ -217,7 +223,9 @@ def _lines(result: Mapping[str, Any], measure: str) -> list[tuple[str, list[floa
         lines.append((f"at random, pool {pool}", chance, row["mean"]["goal_frame_ratio"]))
     for name, row in result["paper"].items():
         shares = [row[task] / 100 if task in row else None for task in tasks]
-        lines.append((f"paper: {name}", shares, row["mean"] / 100))
+        known = [share for share in shares if share is not None]
+        if known:
+            lines.append((f"paper: {name}", shares, sum(known) / len(known)))
     return lines
 
 
@@ -227,14 +235,17 @@ def _tasks(result: Mapping[str, Any]) -> list[str]:
 
 
 def markdown(result: Mapping[str, Any]) -> str:
-    """One table per measure, in percent: our rows, chance, and the paper's."""
+    """One table per measure, in percent: our rows, chance, and the paper's; ± is the standard error over repeats."""
     tasks = _tasks(result)
+    errors = {row["name"]: row["mean"]["top_n_standard_error_of_repeats"] for row in result["rows"]}
     parts = []
     for measure, title in MEASURES.items():
         parts += [f"{title}, %\n", f"| | {' | '.join(tasks)} | mean |", f"|---|{'---|' * (len(tasks) + 1)}"]
         for name, values, mean in _lines(result, measure):
             cells = " | ".join("–" if value is None else f"{100 * value:.1f}" for value in values)
-            parts.append(f"| {name} | {cells} | {100 * mean:.1f} |")
+            error = errors.get(name) if measure == "top_n_success" else None
+            spread = "" if error is None else f" ± {100 * error:.1f}"
+            parts.append(f"| {name} | {cells} | {100 * mean:.1f}{spread} |")
         parts.append("")
     return "\n".join(parts)
 
