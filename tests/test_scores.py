@@ -151,6 +151,20 @@ def test_rewards_to_compare_with_end_best_at_the_goal() -> None:
     assert score_progress(goal, goal) == [0], "an episode that starts at the goal"
 
 
+def test_the_projections_alpha_goes_from_the_plain_distance_to_the_way_alone() -> None:
+    start, goal, aside = np.eye(3, dtype=np.float32)
+    frames = np.stack([start, aside, goal])
+    plain = score_projection(frames, start[None], goal[None], alpha=0.0)
+    assert plain == pytest.approx([cos(frame, goal) for frame in frames.tolist()]), "1 − ½ ‖x − g‖² of unit vectors"
+    way = score_projection(frames, start[None], goal[None], alpha=1.0)
+    assert way == pytest.approx([0, 0.75, 1]), "half-way: what is aside of the way does not count"
+    assert (score_projection(frames, start[None], goal[None]) == score_views(
+        frames[:, None], start[None], goal[None], "projection"
+    )).all()  # fmt: skip
+    with pytest.raises(BadInput, match=r"alpha must be in \[0, 1\], got 1.5"):
+        score_projection(frames, start[None], goal[None], alpha=1.5)
+
+
 @FEATURES
 @given(case=cases())
 def test_cosines_lie_in_minus_one_to_one_and_negative_distances_at_or_below_zero(case: Case, features: str) -> None:

@@ -19,7 +19,7 @@ Features = Literal["raw", "delta", "projection", "progress", "classifier"]
 """Of the paper the first two; the others are rewards to compare with, which bring a similarity of their own."""
 Similarity = Literal["cos", "l2"]
 PROJECTED = 0.5
-"""α of `score_projection`: 0 is the plain distance to the goal, 1 sees nothing but the way from start to goal."""
+"""α of `score_projection`, unless it is called with another one."""
 LOGIT_SCALE = 100.0
 """What CLIP multiplies its cosines by before a softmax."""
 NUMBERS = {"projection": PROJECTED, "classifier": LOGIT_SCALE}
@@ -176,22 +176,28 @@ def _checked(
 
 
 def score_projection(
-    frame_embeddings: FloatArray, start_embeddings: FloatArray, goal_embeddings: FloatArray
+    frame_embeddings: FloatArray,
+    start_embeddings: FloatArray,
+    goal_embeddings: FloatArray,
+    alpha: float = PROJECTED,
 ) -> FloatArray:
     """Goal-baseline regularised similarity: 1 − ½ ‖(αP + (1−α)I)(x − g)‖², averaged over goals.
 
-    x and g are unit vectors, b the unit vector of the start that g is paired with, P the projection onto g − b, α
-    `PROJECTED`. Rocamonde et al. 2023, https://arxiv.org/abs/2310.12921, with pictures or sentences alike.
+    x and g are unit vectors, b the unit vector of the start that g is paired with, P the projection onto g − b.
+    Rocamonde et al. 2023, https://arxiv.org/abs/2310.12921, with pictures or sentences alike.
 
-    Args, Returns, Raises: see `score_delta`; scores are at most 1.
+    Args, Returns, Raises: see `score_delta`; `alpha` must be in [0, 1], 0 is the plain distance to the goal, 1 sees
+    nothing but the way from start to goal; scores are at most 1.
     """
+    if not 0 <= alpha <= 1:
+        raise BadInput(f"alpha must be in [0, 1], got {alpha}")
     frames, goals, starts = (_unit(rows) for rows in _checked(frame_embeddings, start_embeddings, goal_embeddings))
     similarities = []
     for goal, start in zip(goals, starts, strict=True):
         away, way = frames - goal, goal - start
         squared = way @ way
         along = np.outer(away @ way, way) / squared if squared > 0 else np.zeros_like(away)
-        rest = PROJECTED * along + (1 - PROJECTED) * away
+        rest = alpha * along + (1 - alpha) * away
         similarities.append(1 - (rest**2).sum(axis=1) / 2)
     return _mean_over_goals(np.stack(similarities, axis=1))
 
