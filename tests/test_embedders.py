@@ -431,11 +431,24 @@ def test_a_registered_embedder_that_fails_is_named(uri: str, message: str) -> No
 
 @pytest.mark.usefixtures("plugin")
 def test_a_registered_embedder_works_in_every_verb(
-    collected: str, tmp_path: Path, zest: Callable[..., dict[str, Any]]
+    collected: str, frames: list[np.ndarray], tmp_path: Path, zest: Callable[..., dict[str, Any]]
 ) -> None:
-    relabeled = zest(
-        "relabel", collected, "--embedder", "colour:32", "--views", 2, "--tolerance", 0.05, "--n-workers", 2
-    )["dataset"]
+    embedder = ("--embedder", "colour:32")
+    kitchen = (*embedder, "--views", 2, "--tolerance", 0.05, "--n-workers", 2)
+    for what in ("goals", "actions"):
+        assert zest("select", what, collected, "--top", 1, *kitchen)["n_satisfying"] > 0
+    assert zest("follow", "kitchen", "knob3", "sdoor", *kitchen, "--output", tmp_path / "f.html")["sub_goals"]
+    clips = tmp_path / "clips" / "oven"
+    for clip in "abc":
+        (clips / clip).mkdir(parents=True)
+        for i, frame in enumerate(frames):
+            Image.fromarray(frame).save(clips / clip / f"{i}.png")
+    assert zest("select", "footage", clips.parent, *embedder)["objects"]
+    goals = ("--goals", clips / "a" / "4.png", "--output", tmp_path / "v.html")
+    assert zest("follow", "video", clips / "b", *embedder, *goals)["sub_goals"]
+    relabeled = zest("relabel", collected, *kitchen)["dataset"]
+    zest("export", relabeled, "--to", "npz", "--output", tmp_path / "data.npz")
+    assert (tmp_path / "data.npz").is_file()
     assert zest("inspect", relabeled, "--output", tmp_path / "page.html")["datasets"][relabeled]["figures"]
     small = ("--n-updates", 5, "--hidden-size", 32, "--n-layers", 1, "--context-len", 2)
     run = zest("train", "dt", relabeled, "--run-dir", tmp_path / "run", *small)["run"]

@@ -105,6 +105,27 @@ def test_the_clips_of_one_action_on_the_objects_are_found(root: Path) -> None:
     assert [clip.thing for clip in something_something(root, things=("drawer",))] == ["drawer"] * 3
 
 
+def test_an_object_has_several_names_in_labels(tmp_path: Path) -> None:
+    names = {
+        "my refrigerator": "fridge",
+        "the fridge door": "fridge",
+        "cardboard boxes": "box",
+        "a laptop computer": "laptop",
+        "Oven": "oven",
+        "a microwave oven": None,
+        "door": "door",
+        "washing machine": "washing machine",
+        "a doorbell": None,
+    }
+    (tmp_path / VIDEOS).mkdir()
+    for i in range(len(names)):
+        (tmp_path / VIDEOS / f"{i}.webm").touch()
+    labels = [{"id": i, "template": OPENING, "placeholders": [name]} for i, name in enumerate(names)]
+    (tmp_path / LABELS[0]).write_text(json.dumps(labels))
+    found = {clip.path.stem: clip.thing for clip in something_something(tmp_path)}
+    assert [found.get(str(i)) for i in range(len(names))] == list(names.values())
+
+
 @pytest.mark.parametrize("name", LABELS)
 def test_labels_are_found_where_any_release_has_them(root: Path, name: str) -> None:
     (root / name).parent.mkdir(exist_ok=True)

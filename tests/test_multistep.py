@@ -117,7 +117,9 @@ def two_doors(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_video_is_followed_by_pictures_of_its_sub_goals(two_doors: Path, zest: Zest) -> None:
+def test_a_video_is_followed_by_pictures_of_its_sub_goals(
+    two_doors: Path, zest: Zest, monkeypatch: pytest.MonkeyPatch
+) -> None:
     page, clip = two_doors / "page.html", two_doors / "clip"
     words = ("follow", "video", clip, "--output", page, "--goals")
     result = zest(*words, two_doors / "ldoor.png", two_doors / "sdoor.png")
@@ -128,6 +130,12 @@ def test_a_video_is_followed_by_pictures_of_its_sub_goals(two_doors: Path, zest:
     assert left["scores"][5] == pytest.approx(1.0, abs=1e-3), "the frame is the goal picture"
     assert left["done_at"] is None
     assert zest(*words, two_doors / "sdoor.png", two_doors / "ldoor.png")["in_order"] is False
+    monkeypatch.setenv("DOORS", str(two_doors))
+    (two_doors / "doors.toml").write_text(
+        'verb = "follow video"\nclip = "$DOORS/clip"\ngoals = ["$DOORS/ldoor.png", "$DOORS/sdoor.png"]\n'
+    )
+    again = zest("reproduce", two_doors / "doors.toml", "--output", two_doors / "out")
+    assert again["sub_goals"] == result["sub_goals"]
     by_folder = zest(*words, two_doors / "spec")["sub_goals"]["spec"]
     assert by_folder["scores"] == sliding["scores"], "the folder holds the same two pictures"
 

@@ -32,6 +32,13 @@ from zest_rl.types import FloatArray, Frame
 OPENING = "Opening [something]"
 OBJECTS = ("door", "drawer", "box", "fridge", "laptop", "washing machine", "oven")
 """The seven objects of the paper."""
+CALLED = {
+    "box": "box(es)?",
+    "fridge": "(fridge|refrigerator)s?",
+    "laptop": "laptops?( computers?)?",
+    "oven": "(?<!microwave )ovens?",
+}
+"""What labels call an object, where it is not its name alone or with an s."""
 GOAL_SHARE = 0.2
 VIDEOS = "20bn-something-something-v2"
 LABELS = tuple(
@@ -118,7 +125,8 @@ def something_something(root: Path, things: Sequence[str] = OBJECTS, template: s
     """Find the clips of one action on some objects in a folder laid out as Something-Something V2.
 
     The folder holds ``20bn-something-something-v2/ID.webm`` and one of `LABELS`, lists of ``{"id", "template",
-    "placeholders"}``. A clip is of an object when its first placeholder ends with it: "a kitchen drawer" is a drawer.
+    "placeholders"}``. A clip is of what its first placeholder ends with: "a kitchen drawer" is a drawer, "the fridge
+    door" a fridge.
 
     Raises:
         BadInput: the layout is another one, or no clip is found.
@@ -133,8 +141,7 @@ def something_something(root: Path, things: Sequence[str] = OBJECTS, template: s
             for entry in entries:
                 templates.add(entry["template"])
                 if entry["template"] == template:
-                    words = str(entry["placeholders"][0]).lower().strip()
-                    thing = next((one for one in things if re.search(rf"\b{re.escape(one)}s?$", words)), None)
+                    thing = _named(str(entry["placeholders"][0]).lower().strip(), things)
                     path = root / VIDEOS / f"{entry['id']}.webm"
                     if thing is not None and path.is_file():
                         clips.append(Clip(path, thing))
@@ -145,6 +152,16 @@ def something_something(root: Path, things: Sequence[str] = OBJECTS, template: s
     if not clips:
         raise BadInput(f"{root} has no video of {template!r} with {', '.join(things)}")
     return clips
+
+
+def _named(words: str, things: Sequence[str]) -> str | None:
+    """Return which thing a label names, if any."""
+
+    def ends(text: str) -> str | None:
+        called = {thing: CALLED.get(thing, f"{re.escape(thing)}s?") for thing in things}
+        return next((thing for thing, name in called.items() if re.search(rf"\b({name})$", text)), None)
+
+    return ends(re.sub(r"\s+doors?$", "", words)) or ends(words)
 
 
 def folder_of_clips(root: Path) -> list[Clip]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
+from zest_rl.cli.recipes import expand_variables
 from zest_rl.cli.ui import Ui
 from zest_rl.scores import Features, Similarity, check_names
 
@@ -60,7 +61,8 @@ class KitchenArguments(Arguments):
 @dataclass(frozen=True, kw_only=True)
 class VideoArguments(Arguments):
     """A video, or a folder of pictures in the order of their names; each sub-goal is a picture (the video's first frame
-    is its start), a folder with init/ and goal/, or "text:START -> GOAL".
+    is its start), a folder with init/ and goal/, or "text:START -> GOAL". In a recipe, $NAME in a path stands for an
+    environment variable.
     """
 
     what: ClassVar[str] = "video"
@@ -129,10 +131,13 @@ def _kitchen(config: KitchenArguments, ui: Ui) -> list[Followed]:
 
 def _video(config: VideoArguments) -> list[Followed]:
     from zest_rl.embedders import load_embedder
+    from zest_rl.goals import TEXT
     from zest_rl.multistep import follow_clip
 
     embedder = load_embedder(config.embedder, device=config.device, precision=config.precision)
-    return follow_clip(config.clip, config.goals, embedder, config.n_frames, config.features, config.similarity)
+    goals = [goal if goal.startswith(TEXT) else str(expand_variables(Path(goal))) for goal in config.goals]
+    clip = expand_variables(config.clip)
+    return follow_clip(clip, goals, embedder, config.n_frames, config.features, config.similarity)
 
 
 def summary(result: Mapping[str, Any]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import os
 import tomllib
 import types
 from collections.abc import Mapping, Sequence
@@ -47,6 +48,18 @@ def read_recipe(path: Path) -> dict[str, Any]:
         return tomllib.loads(found.read_text(encoding="utf-8"))
     except ValueError as error:
         raise BadInput(f"recipe {path} is not TOML: {error}") from error
+
+
+def expand_variables(path: Path) -> Path:
+    """Replace ``$NAME`` by environment variables, so that a recipe may name a folder that is elsewhere for everybody.
+
+    Raises:
+        BadInput: one of them is not set.
+    """
+    expanded = Path(os.path.expandvars(path))
+    if "$" in str(expanded) and not expanded.exists():
+        raise BadInput(f"{expanded} names an environment variable that is not set; set it to where the data are")
+    return expanded
 
 
 def load_config(config_class: type[C], recipe: Mapping[str, Any], source: str) -> C:

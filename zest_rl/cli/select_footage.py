@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
+from zest_rl.cli.recipes import expand_variables
 from zest_rl.cli.ui import Ui
 from zest_rl.errors import BadInput
 from zest_rl.scores import Features, Similarity, check_names
@@ -68,7 +68,7 @@ class FootageArguments:
             raise BadInput("actions are sought among all objects, each clip against its own start; give --pool all")
         for folder in (self.folder, self.goals):
             if folder is not None:
-                _located(folder)
+                expand_variables(folder)
 
 
 def run(config: FootageArguments, ui: Ui) -> dict[str, Any]:
@@ -78,7 +78,7 @@ def run(config: FootageArguments, ui: Ui) -> dict[str, Any]:
     from zest_rl import footage
     from zest_rl.embedders import load_embedder
 
-    folder, goal_folder = _located(config.folder), _located(config.goals or config.folder)
+    folder, goal_folder = expand_variables(config.folder), expand_variables(config.goals or config.folder)
     within = goal_folder.resolve() == folder.resolve()
     found = footage.find_clips(folder, config.template)
     goal_clips = found if within else footage.find_clips(goal_folder, config.template)
@@ -155,14 +155,6 @@ def _judge(config: FootageArguments, pools: Iterable[Frames], goals: Sequence[Fl
         "top": min(picked),
         "n_goals": len(tops),
     }
-
-
-def _located(folder: Path) -> Path:
-    """Replace environment variables in the path; refuse those that are not set."""
-    path = os.path.expandvars(folder)
-    if path.startswith("$"):
-        raise BadInput(f"{path} names an environment variable that is not set; set it to a folder of clips")
-    return Path(path)
 
 
 def summary(result: dict[str, Any]) -> str:
