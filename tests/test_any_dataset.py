@@ -23,6 +23,7 @@ import pyarrow
 import pyarrow.parquet
 import pytest
 from gymnasium import spaces
+from gymnasium_robotics.utils import mujoco_utils
 from minari.data_collector import EpisodeBuffer
 from PIL import Image
 
@@ -387,11 +388,15 @@ def recorded(episode: Episode) -> dict[str, Any]:
     return {"state": {key: np.stack([state[key] for state in episode.state]) for key in episode.state[0]}}
 
 
+def stacked(values: list[Any]) -> Any:
+    """Rows of an array, or of those in a dict."""
+    if isinstance(values[0], dict):
+        return {key: stacked([value[key] for value in values]) for key in values[0]}
+    return np.stack(values)
+
+
 def as_observed(episode: Episode) -> Any:
-    first = episode.observations[0]
-    if isinstance(first, dict):
-        return {key: rows(episode, key) for key in first}
-    return np.stack(episode.observations)
+    return stacked(episode.observations)
 
 
 def write_states(dataset_id: str, env_id: str, episodes: list[Episode], *, with_state: bool = True) -> str:
@@ -402,21 +407,58 @@ def write_states(dataset_id: str, env_id: str, episodes: list[Episode], *, with_
 
 def rendered(env_id: str, camera: str | None, episode: Episode, seed: int) -> list[Frame]:
     """The same states in an environment of their own, through Gymnasium's own renderer."""
-    env: Any = gymnasium.make(env_id, render_mode="rgb_array", width=224, height=224, camera_name=camera)
-    quality = env.unwrapped.model.vis.quality
-    quality.shadowsize = quality.offsamples = 0
+    chosen = {} if camera is None else {"camera_name": camera}
+    env: Any = gymnasium.make(env_id, render_mode="rgb_array", width=224, height=224, **chosen)
+    bare = env.unwrapped
+    bare.model.vis.quality.shadowsize = bare.model.vis.quality.offsamples = 0
     env.reset(seed=seed)
-    renderer = env.unwrapped.mujoco_renderer
-    frames = [env.render()]
-    flags = renderer.viewer.scn.flags
+    env.render()
+    inner = next((part for name in ("point_env", "ant_env", "robot_env") if (part := getattr(bare, name, None))), bare)
+    flags = inner.mujoco_renderer.viewer.scn.flags
     for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_SKYBOX):
         flags[flag] = False
-    frames = [env.render()]
-    for state in episode.state[1:]:  # after a step, Gymnasium shows positions of one substep before
-        env.unwrapped.set_state(state["qpos"], state["qvel"])
+    frames = []
+    for state in episode.state:  # after a step, Gymnasium shows positions of one substep before
+        bare.data.qpos[:] = state["qpos"]
+        mujoco.mj_forward(bare.model, bare.data)
+        if bare.model.nmocap:  # Fetch's gripper is pulled along by one
+            mujoco_utils.reset_mocap2body_xpos(bare.model, bare.data)
         frames.append(env.render())
     env.close()
     return frames
+
+
+@pytest.mark.parametrize(
+    "env_id",
+    [
+        "AdroitHandPen-v1",
+        "AdroitHandDoor-v1",
+        "FetchReach-v4",
+        "PointMaze_UMaze-v3",
+        "AntMaze_UMaze-v5",
+        "HalfCheetah-v5",
+        "Humanoid-v5",
+        "Reacher-v5",
+        "FrankaKitchen-v1",
+    ],
+)
+def test_without_a_camera_frames_are_those_that_the_environment_renders(env_id: str) -> None:
+    (episode,) = roll_out(env_id, (3,))
+    source = open_source(write_states("some/random-v0", env_id, [episode]))
+    ours = [views[0] for views in source.frames.read(0)]
+    np.testing.assert_array_equal(ours, rendered(env_id, None, episode, seed=0))
+    assert max(np.std(frame) for frame in ours) > 10, "it shows something"
+
+
+def test_the_environments_own_camera_stays_where_it_stood_at_first_and_embeddings_depend_on_it() -> None:
+    episodes = roll_out("HalfCheetah-v5", (2, 2))
+    both = open_source(write_states("cheetah/both-v0", "HalfCheetah-v5", episodes)).frames
+    last = open_source(write_states("cheetah/last-v0", "HalfCheetah-v5", episodes[1:])).frames
+    assert both.describe()["camera_pose"][1] == 4.0, "metres, of the environment's default_camera_config"
+    assert both.describe()["camera_pose"] != last.describe()["camera_pose"]
+    assert both.digest(1) != last.digest(0), "the same states, seen from elsewhere"
+    cameras = [open_source(f"cheetah/{name}-v0", cameras=["track"]).frames for name in ("both", "last")]
+    assert cameras[0].digest(1) == cameras[1].digest(0)
 
 
 def test_states_are_rendered_as_the_environment_itself_shows_them_with_the_door_where_it_stood(

@@ -14,7 +14,7 @@ import importlib.metadata
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -36,10 +36,12 @@ from zest_rl.types import Frame
 SIZE = 224
 """Side of the square frames, in pixels."""
 Doubles = NDArray[np.float64]
+Pose = tuple[tuple[float, float, float], float, float, float]
+"""Point that a camera looks at and distance from it in metres, azimuth and elevation in degrees."""
 Columns = tuple[tuple[str, int], ...]
 """Paths within an episode and how many of their first columns make up qpos, in order; -1: all."""
 
-_VERSION = 1  # raise it with any change of this file that changes a pixel: cached embeddings depend on it
+_VERSION = 2  # raise it with any change of this file that changes a pixel: cached embeddings depend on it
 _MAZES = "gymnasium_robotics.envs.maze."
 _ADROIT = "gymnasium_robotics.envs.adroit_hand."
 _FETCH = "gymnasium_robotics.envs.fetch."
@@ -69,6 +71,8 @@ class States:
     """Paths of what else is put into the scene."""
     cameras: tuple[str, ...] = ()
     """Of the model; empty: where the environment's own camera stands."""
+    pose: Pose | None = None
+    """Of that camera."""
 
     @property
     def views(self) -> Sequence[str]:
@@ -82,6 +86,7 @@ class States:
             "views": list(self.views),
             "qpos_from": [list(column) for column in self.qpos],
             "scenery_from": list(self.scenery),
+            "camera_pose": self.pose,
             "size": SIZE,
             "env_id": json.loads(self.env_spec).get("id"),
         }
@@ -91,14 +96,14 @@ class States:
         versions = [importlib.metadata.version(name) for name in ("mujoco", "gymnasium", "gymnasium-robotics")]
         recorded = self._recorded(episode)
         model = stage_of(self.env_spec, self.cameras).model_sha256
-        how = [self.env_spec, versions, model, self.cameras, SIZE, _VERSION, sorted(recorded)]
+        how = [self.env_spec, versions, model, self.cameras, self.pose, SIZE, _VERSION, sorted(recorded)]
         return artifacts.hash_json([artifacts.hash_arrays(*(recorded[name] for name in sorted(recorded))), how])
 
     def read(self, episode: int) -> Iterator[Sequence[Frame]]:
         """Render each state."""
         recorded, stage = self._recorded(episode), stage_of(self.env_spec, self.cameras)
         for step in range(len(recorded["qpos"])):
-            yield stage.render({name: values[step] for name, values in recorded.items()})
+            yield stage.render({name: values[step] for name, values in recorded.items()}, self.pose)
 
     def _recorded(self, episode: int) -> dict[str, Doubles]:
         """Read qpos (T+1, nq), and by its last name all that is put into the scene (T+1, n)."""
@@ -181,10 +186,12 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
             "without that would be wrong. Record it, or give --frames FOLDER"
         )
     states = States(file, tuple(episodes), env_spec, columns, scenery, tuple(cameras))
-    n_found = states._recorded(0)["qpos"].shape[1]
-    if n_found != stage.model.nq:
-        raise BadInput(f"{what}: qpos must have {stage.model.nq} columns for {spec.get('id')}, got {n_found}")
-    return states
+    start = {name: values[0] for name, values in states._recorded(0).items()}
+    if len(start["qpos"]) != stage.model.nq:
+        raise BadInput(
+            f"{what}: qpos must have {stage.model.nq} columns for {spec.get('id')}, got {len(start['qpos'])}"
+        )
+    return states if cameras else replace(states, pose=stage.own_pose(start))
 
 
 # --- the environment as a stage ---------------------------------------------------------------------------------------
@@ -210,13 +217,37 @@ class Stage:
                 f"{entry_point} places targets only while it renders, in a way that is not known here; give --frames "
                 "FOLDER with a video of each episode"
             )
-        self._canvas = Canvas(self.model, tuple(_camera(env, name) for name in cameras or (None,)), SIZE)
+        self._renderer = _renderer_of(env)
+        self._own = mujoco.MjvCamera()
+        if (fixed := getattr(self._renderer, "camera_id", -1)) >= 0:  # that the environment was made with
+            self._own.type, self._own.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, fixed
+        views = tuple(_camera(self.model, name) for name in cameras) or (self._own,)
+        self._canvas = Canvas(self.model, views, SIZE)
         self._canvas.hide_sky()
 
-    def render(self, recorded: Mapping[str, Doubles]) -> list[Frame]:
-        """Draw one state: one (H, W, 3) frame per camera."""
+    def own_pose(self, recorded: Mapping[str, Doubles]) -> Pose:
+        """Return where the camera of ``env.render()`` stands if this state is the first that it shows.
+
+        As Gymnasium's `OffScreenViewer` and `MujocoRenderer` place it: it stays there, whatever moves.
+        """
         self._put(self.env, recorded)
         mujoco.mj_fwdPosition(self.model, self.data)
+        camera = mujoco.MjvCamera()
+        x, y, z = np.median(self.data.geom_xpos, axis=0).tolist()
+        settings = getattr(self._renderer, "default_cam_config", None) or {}
+        camera.lookat, camera.distance = settings.get("lookat", (x, y, z)), self.model.stat.extent
+        for field in ("distance", "azimuth", "elevation"):
+            if field in settings:
+                setattr(camera, field, settings[field])
+        x, y, z = camera.lookat.tolist()
+        return (x, y, z), camera.distance, camera.azimuth, camera.elevation
+
+    def render(self, recorded: Mapping[str, Doubles], pose: Pose | None = None) -> list[Frame]:
+        """Draw one state: one (H, W, 3) frame per camera; `pose` is of the environment's own."""
+        self._put(self.env, recorded)
+        mujoco.mj_fwdPosition(self.model, self.data)
+        if pose is not None:
+            self._own.lookat, self._own.distance, self._own.azimuth, self._own.elevation = pose
         return list(self._canvas.draw(self.data))
 
     def close(self) -> None:
@@ -253,24 +284,18 @@ def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
     return stage
 
 
-def _camera(env: Any, name: str | None) -> mujoco.MjvCamera:
-    """Return a camera of the model; without a name the one that ``env.render()`` uses: "track", or a free one."""
-    model, camera = env.model, mujoco.MjvCamera()
-    names = [model.camera(i).name for i in range(model.ncam)]
-    if name is None and "track" in names:
-        name = "track"
-    if name is not None:
-        if name not in names:
-            raise BadInput(f"the model has no camera {name!r}; {nearest(name, names)}")
-        camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, names.index(name)
-        return camera
-    mujoco.mjv_defaultFreeCamera(model, camera)
+def _renderer_of(env: Any) -> Any:
+    """Return Gymnasium's renderer of an environment, or of the one that it is built on; None: it has none."""
     inner = (getattr(env, part, None) for part in ("point_env", "ant_env", "robot_env"))
-    renderers = (getattr(one, "mujoco_renderer", None) for one in (env, *inner))
-    settings = next((one.default_cam_config for one in renderers if one is not None), None) or {}
-    for field in ("lookat", "distance", "azimuth", "elevation"):
-        if field in settings:
-            setattr(camera, field, settings[field])
+    return next((found for one in (env, *inner) if (found := getattr(one, "mujoco_renderer", None)) is not None), None)
+
+
+def _camera(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:
+    """Return a camera of the model."""
+    camera, names = mujoco.MjvCamera(), [model.camera(i).name for i in range(model.ncam)]
+    if name not in names:
+        raise BadInput(f"the model has no camera {name!r}; {nearest(name, names)}")
+    camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, names.index(name)
     return camera
 
 
@@ -292,6 +317,7 @@ def _pose_maze(env: Any, recorded: Mapping[str, Doubles]) -> None:
 def _pose_fetch(env: Any, recorded: Mapping[str, Doubles]) -> None:
     _pose(env, recorded)
     mujoco.mj_forward(env.model, env.data)
+    env._utils.reset_mocap2body_xpos(env.model, env.data)  # faint lines that lead the gripper
     env.goal = recorded["desired_goal"]
     env._render_callback()  # what it does before each frame of its own: the target goes where the goal is
 
