@@ -542,8 +542,30 @@ def test_code_that_is_not_the_registered_environments_is_not_run(
 def edit_spec(dataset: str, **changes: Any) -> None:
     path = data.dataset_path(dataset) / data.METADATA_FILE
     metadata = json.loads(path.read_text())
-    metadata["env_spec"] = json.dumps(json.loads(metadata["env_spec"]) | changes)
+    spec = json.loads(metadata.get("env_spec") or gymnasium.spec("PointMaze_UMaze-v3").to_json())
+    metadata["env_spec"] = json.dumps(spec | changes)
     path.write_text(json.dumps(metadata))
+
+
+@pytest.mark.parametrize("entry_point", ["ale_py.env:AtariEnv", "my_robot.envs:MyRobotEnv"])
+def test_pictures_of_any_environment_are_taken_for_it_is_never_built(
+    entry_point: str,
+    pictured: str,
+    maze: list[Episode],
+    goal: Path,
+    zest: Run,
+    refusal: Callable[..., tuple[int, str]],
+    tmp_path: Path,
+) -> None:
+    edit_spec(pictured, id="Robot-v0", entry_point=entry_point)
+    made = zest("relabel", pictured, "--goal", goal, "--frames", "cameras/top", "--n-workers", "1")["dataset"]
+    assert zest("inspect", made, "--output", tmp_path / "page.html")["datasets"].keys() == {made}
+    assert zest("export", made, "--output", tmp_path / "maze.npz")["n_transitions"] == sum(LENGTHS)
+    states = write_states("maze/random-v0", "PointMaze_UMaze-v3", maze)
+    edit_spec(states, id="Robot-v0", entry_point=entry_point)
+    code, error = refusal("relabel", states, "--goal", goal)
+    assert (code, f"would run code of {entry_point!r}; only gymnasium.*" in error) == (2, True)
+    assert "are trusted; give --frames FOLDER" in error
 
 
 def test_an_env_spec_that_is_none_is_refused(

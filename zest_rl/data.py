@@ -77,8 +77,10 @@ def exists(dataset_id: str) -> bool:
 def read_metadata(dataset_id: str) -> dict[str, Any]:
     """Return a dataset's metadata after checking that its files are as they were written.
 
+    Whoever builds an environment from them calls `check_env_spec` first; reading runs no code of it.
+
     Raises:
-        BadInput: no such dataset (the nearest are named), or its environment's code is not of a trusted package.
+        BadInput: no such dataset (the nearest are named), or an env_spec in it is none.
         ZestError: a file was damaged or changed since it was written.
     """
     folder = dataset_path(dataset_id)
@@ -98,26 +100,30 @@ def read_metadata(dataset_id: str) -> dict[str, Any]:
     metadata: dict[str, Any] = artifacts.read_json(folder / METADATA_FILE)
     for key in ("env_spec", "eval_env_spec"):
         if metadata.get(key):
-            check_env_spec(metadata[key], f"the {key} of dataset {dataset_id}")
+            _entry_points(metadata[key], f"the {key} of dataset {dataset_id}")
     return metadata
 
 
-def check_env_spec(env_spec: str, what: str) -> None:
+def _entry_points(env_spec: str, what: str) -> list[str]:
+    """Return the code that a Gymnasium EnvSpec (JSON) would run: of its environment, and of wrappers."""
+    try:
+        spec = json.loads(env_spec)
+        return [str(part["entry_point"]) for part in (spec, *spec.get("additional_wrappers", ()))]
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise BadInput(f"{what} is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
+
+
+def check_env_spec(env_spec: str, what: str, instead: str = "") -> None:
     """Refuse a Gymnasium EnvSpec (JSON) that would run code of an unknown package: of its environment or a wrapper.
 
     Raises:
-        BadInput: such an entry point, or not an EnvSpec; `what` names it in the message.
+        BadInput: such an entry point, or not an EnvSpec; `what` names it in the message, `instead` ends it.
     """
-    try:
-        spec = json.loads(env_spec)
-        entry_points = [str(part["entry_point"]) for part in (spec, *spec.get("additional_wrappers", ()))]
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise BadInput(f"{what} is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
-    for entry_point in entry_points:
+    for entry_point in _entry_points(env_spec, what):
         if not entry_point.startswith(TRUSTED_ENTRY_POINTS):
             raise BadInput(
                 f"{what} would run code of {entry_point!r}; only {', '.join(p + '*' for p in TRUSTED_ENTRY_POINTS)} "
-                "are trusted. Remove it from metadata.json if you do not need the environment"
+                f"are trusted{instead}"
             )
 
 

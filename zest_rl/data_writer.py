@@ -317,7 +317,7 @@ def write_relabeled(
     extra: Callable[[Path], None],
 ) -> Path:
     """Write a copy of a Minari dataset with other rewards: `write_scored` of its trajectories."""
-    read_metadata(source_id)  # its files are whole, its environment is trusted
+    read_metadata(source_id)  # its files are whole
     return write_scored(Copied(source_id), dataset_id, rewards, scores, description=description, zest=zest, extra=extra)
 
 

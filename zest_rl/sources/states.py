@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl import artifacts
+from zest_rl.data import check_env_spec
 from zest_rl.envs import check_registered
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.observations import entries
@@ -138,7 +139,7 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
     Args:
         file: its HDF5 file.
         episodes: the groups in it.
-        env_spec: of its environment, as JSON, checked by `zest_rl.data.check_env_spec`.
+        env_spec: of its environment, as JSON.
         cameras: of the model; empty: the environment's own.
         what: names the dataset in an error.
 
@@ -151,6 +152,7 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
             f"{what} shows no frames: there are no pictures to choose, and it names no environment whose recorded "
             "states could be rendered; give --frames FOLDER with a video of each episode"
         )
+    check_env_spec(env_spec, f"the env_spec of {what}", "; give --frames FOLDER with a video of each episode")
     spec = json.loads(env_spec)
     entry_point, kwargs = str(spec["entry_point"]), spec.get("kwargs") or {}
     with h5py.File(file, "r") as opened:
