@@ -264,6 +264,29 @@ def test_the_only_camera_is_found_by_itself_also_as_jpeg_in_a_flat_observation(
         np.testing.assert_allclose(scores, expected_scores([list(episode.observations)], goal), atol=1e-4)
 
 
+def test_rewards_need_not_be_recorded(pictured: str, goal: Path, zest: Run, tmp_path: Path) -> None:
+    words = ["--goal", goal, "--frames", "cameras/top", "--n-workers", "1"]
+    with h5py.File(data.dataset_path(pictured) / data.DATA_FILE, "r+") as file:
+        for episode in file.values():
+            del episode["rewards"]
+    made = zest("relabel", pictured, *words)["dataset"]
+    for scores, found in zip(data.read_scores(made), minari.load_dataset(made), strict=True):
+        np.testing.assert_array_equal(found.rewards, scores[1:])
+        assert "source" not in found.infos
+    zest("export", made, "--output", tmp_path / "maze.npz")
+    assert "source_reward" not in np.load(tmp_path / "maze.npz")
+
+
+def test_episodes_that_minari_could_not_read_are_refused_before_any_work(
+    pictured: str, goal: Path, refusal: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    with h5py.File(data.dataset_path(pictured) / data.DATA_FILE, "r+") as file:
+        del file["episode_1"]
+    code, error = refusal("relabel", pictured, "--goal", goal, "--frames", "cameras/top")
+    assert (code, "must hold episode_0, … episode_1, as Minari needs it" in error) == (2, True)
+    assert not (tmp_path / "cache" / "frames").exists()
+
+
 def test_the_metadata_tells_where_the_frames_came_from(pictured: str, goal: Path, zest: Run) -> None:
     made = zest("relabel", pictured, "--goal", goal, "--frames", "cameras/top")["dataset"]
     facts = data.read_metadata(made)["zest"]["relabel"]
@@ -759,7 +782,7 @@ def test_other_files_are_refused(
 # --- LeRobot ----------------------------------------------------------------------------------------------------------
 
 
-def write_lerobot(root: Path, maze: list[Episode], *, version: str = "v3.0") -> Path:
+def write_lerobot(root: Path, maze: list[Episode], *, version: str = "v3.0", number: int = 0, step: int = 1) -> Path:
     """The layout of https://huggingface.co/docs/lerobot/lerobot-dataset-v3: two episodes in the first files."""
     fps, key = 10, "observation.images.top"
     rows_of, first = [], 0
@@ -774,7 +797,7 @@ def write_lerobot(root: Path, maze: list[Episode], *, version: str = "v3.0") -> 
                 "next.truncated": [False] * n_steps,
                 "timestamp": (np.arange(n_steps) / fps).astype(np.float32).tolist(),
                 "frame_index": list(range(n_steps)),
-                "episode_index": [i] * n_steps,
+                "episode_index": [number + step * i] * n_steps,
                 "index": list(range(first, first + n_steps)),
                 "task_index": [0] * n_steps,
             }
@@ -795,7 +818,7 @@ def write_lerobot(root: Path, maze: list[Episode], *, version: str = "v3.0") -> 
             place = {"chunk_index": 0, "file_index": file}
             listed.append(
                 {
-                    "episode_index": i,
+                    "episode_index": number + step * i,
                     "tasks": ["go there"],
                     "length": length,
                     **{f"data/{name}": value for name, value in place.items()},
@@ -809,12 +832,12 @@ def write_lerobot(root: Path, maze: list[Episode], *, version: str = "v3.0") -> 
     (root / "meta" / "episodes" / "chunk-000").mkdir(parents=True)
     table = pyarrow.Table.from_pylist(listed)
     pyarrow.parquet.write_table(table, root / "meta" / "episodes" / "chunk-000" / "file-000.parquet")
-    number = {"dtype": "float32", "names": None}
+    one = {"dtype": "float32", "names": None}
     features = {
         key: {"dtype": "video", "shape": [SIDE, SIDE, 3], "info": {"video.is_depth_map": False}},
-        "observation.state": {**number, "shape": [4]},
-        "action": {**number, "shape": [2]},
-        "next.reward": {**number, "shape": [1]},
+        "observation.state": {**one, "shape": [4]},
+        "action": {**one, "shape": [2]},
+        "next.reward": {**one, "shape": [1]},
         "next.done": {"dtype": "bool", "shape": [1]},
         "next.truncated": {"dtype": "bool", "shape": [1]},
         "episode_index": {"dtype": "int64", "shape": [1]},
@@ -855,6 +878,22 @@ def test_a_lerobot_folder_becomes_a_minari_dataset(
     videos[1].unlink()
     code, error = refusal("relabel", root, "--goal", goal)
     assert (code, "lacks videos/observation.images.top/chunk-000/file-001.mp4" in error) == (2, True)
+
+
+def test_a_part_of_a_lerobot_dataset_keeps_its_order_whatever_its_numbers(
+    maze: list[Episode], goal: Path, zest: Run, refusal: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    folders = write_lerobot(tmp_path / "whole", maze), write_lerobot(tmp_path / "part", maze, number=3, step=2)
+    whole, part = (open_source(str(folder)) for folder in folders)
+    assert part.trajectories.fingerprint() == whole.trajectories.fingerprint()
+    for i in range(len(maze)):
+        np.testing.assert_array_equal(list(part.frames.read(i)), list(whole.frames.read(i)))
+    made = zest("relabel", tmp_path / "part", "--goal", goal, "--n-workers", "1")["dataset"]
+    assert [len(rewards) for rewards in data.read_rewards(made)] == list(LENGTHS)
+    listed = tmp_path / "part" / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    shutil.copyfile(listed, listed.with_name("file-001.parquet"))
+    code, error = refusal("relabel", tmp_path / "part", "--goal", goal)
+    assert (code, "must list every episode once, got 6 rows" in error) == (2, True)
 
 
 def test_an_older_lerobot_dataset_is_refused_with_what_converts_it(

@@ -141,10 +141,20 @@ def test_what_is_read_fits_together(collected: str) -> None:
 
 def test_episodes_are_read_in_the_order_of_their_numbers(collected: str) -> None:
     with edited(collected) as file:
-        file.move("episode_3", "episode_10")
-    last = data.read_episodes(collected)[-1]
+        for i in range(4, 11):
+            file.copy(f"episode_{i % 4}", f"episode_{i}")
+    found = data.read_episodes(collected)
+    assert len(found) == 11
+    for i, episode in enumerate(found):
+        np.testing.assert_array_equal(episode.actions, found[i % 4].actions)
+    assert (found[1].actions != found[2].actions).any()
+
+
+def test_a_gap_in_their_numbers_is_refused_for_minari_could_not_read_it(collected: str) -> None:
     with edited(collected) as file:
-        np.testing.assert_array_equal(last.actions, file["episode_10/actions"][()])
+        file.move("episode_1", "episode_10")
+    with pytest.raises(BadInput, match="must hold episode_0, … episode_3, as Minari needs it, but episode_1 is"):
+        data.read_episodes(collected)
 
 
 def test_only_the_ground_truth_reader_opens_the_ground_truth(collected: str) -> None:

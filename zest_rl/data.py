@@ -136,9 +136,14 @@ def _open(dataset_id: str) -> Iterator[tuple[h5py.File, list[str]]]:
     except OSError as error:
         raise BadInput(f"dataset {dataset_id} cannot be read as HDF5 ({error}); only that storage is read") from error
     with file:
-        names = sorted(file, key=lambda name: int(name.removeprefix("episode_")))
+        names = [f"episode_{i}" for i in range(len(file))]
         if not names:
             raise BadInput(f"dataset {dataset_id} has no episodes; collect it again")
+        if missing := [name for name in names if name not in file]:
+            raise BadInput(
+                f"dataset {dataset_id} must hold {names[0]}, … {names[-1]}, as Minari needs it, but {missing[0]} "
+                f"is missing from its {len(file)} groups; rename them, and set total_episodes in metadata.json"
+            )
         yield file, names
 
 
@@ -200,6 +205,22 @@ def read_episodes(dataset_id: str) -> list[Episode]:
             rewards=_array(group, "rewards", np.float32, dataset_id),
             terminated=bool(len(ends) and ends[-1]),
         )
+
+    return _each(dataset_id, read)
+
+
+def read_lengths(dataset_id: str) -> list[int]:
+    """Read T of every episode; rewards need not be recorded.
+
+    Raises:
+        BadInput: no such dataset, or rewards of another length.
+    """
+
+    def read(group: h5py.Group) -> int:
+        n_steps = len(_array(group, "terminations", bool, dataset_id))
+        if "rewards" in group and len(group["rewards"]) != n_steps:
+            raise BadInput(f"rewards must be as many as terminations, {n_steps}, got {len(group['rewards'])}")
+        return n_steps
 
     return _each(dataset_id, read)
 
@@ -274,14 +295,15 @@ def read_source_rewards(dataset_id: str) -> list[FloatArray] | None:
 
 
 def rewards_to_keep(dataset_id: str) -> list[FloatArray | None]:
-    """Read the rewards (T,) of every episode that a relabeled copy keeps as its source's; None: the ground truth is."""
+    """Read the rewards (T,) of every episode that a relabeled copy keeps as its source's; None: none are there, or it
+    keeps the ground truth."""
 
     def read(group: h5py.Group) -> FloatArray | None:
         if _GT_REWARD in group:
             return None
         if SOURCE_REWARD in group:
             return _array(group, SOURCE_REWARD, np.float32, dataset_id)[1:]
-        return _array(group, "rewards", np.float32, dataset_id)
+        return _array(group, "rewards", np.float32, dataset_id) if "rewards" in group else None
 
     return _each(dataset_id, read)
 
@@ -290,7 +312,6 @@ def fingerprint(dataset_id: str) -> str:
     """Hash what relabeling and training may see of a dataset: observations, actions, ends and states; no rewards."""
 
     def digest(group: h5py.Group) -> str:
-        _array(group, "rewards", np.float32, dataset_id)
         if "observations" not in group:
             raise BadInput(f"dataset {dataset_id} has no 'observations' in {group.name}")
         actions = _array(group, "actions", np.float32, dataset_id)

@@ -29,8 +29,8 @@ from zest_rl.data import (
     dataset_path,
     exists,
     fingerprint,
+    read_lengths,
     read_metadata,
-    read_rewards,
     rewards_to_keep,
 )
 from zest_rl.errors import BadInput, ZestError
@@ -259,7 +259,7 @@ class Copied:
     @cached_property
     def n_steps(self) -> Sequence[int]:
         """T of every episode."""
-        return [len(rewards) for rewards in read_rewards(self.dataset_id)]
+        return read_lengths(self.dataset_id)
 
     @property
     def n_bytes(self) -> int:
