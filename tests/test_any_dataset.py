@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import shutil
 import tempfile
@@ -499,7 +500,7 @@ def test_states_are_rendered_as_the_environment_itself_shows_them_with_the_door_
     assert result["views"] == ["fixed", "vil_camera"]
     check_kept_but_the_rewards(dataset, result["dataset"])
     facts = data.read_metadata(result["dataset"])["zest"]["relabel"]["frames"]
-    assert facts["qpos_from"] == [["infos/state/qpos", -1]]
+    assert facts["qpos_from"] == [["infos/state/qpos", 0, None]]
     assert facts["scenery_from"] == ["infos/state/door_body_pos"]
     code, error = refusal("relabel", dataset, "--goal", goal, "--camera", "fixd")
     assert (code, "has no camera 'fixd'; did you mean 'fixed'?" in error) == (2, True)
@@ -524,30 +525,62 @@ def test_the_target_of_fetch_is_where_the_goal_is_and_its_joints_must_be_recorde
     assert "observations of FetchReach-v4 do not hold it to the bit. Record infos/state/qpos, or give --frames" in error
 
 
-@pytest.mark.parametrize("env_id", ["PointMaze_UMaze-v3", "AntMaze_UMaze-v5", "HalfCheetah-v5"])
-def test_qpos_is_read_from_observations_where_they_hold_it_to_the_bit(env_id: str) -> None:
-    env: Any = gymnasium.make(env_id)
+EXACT = {"robot_noise_ratio": 0.0, "object_noise_ratio": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kwargs"),
+    [
+        ("PointMaze_UMaze-v3", {}),
+        ("AntMaze_UMaze-v5", {}),
+        ("Ant-v5", {}),
+        ("HalfCheetah-v5", {}),
+        ("Hopper-v5", {}),
+        ("Humanoid-v5", {}),
+        ("HumanoidStandup-v5", {}),
+        ("InvertedPendulum-v5", {}),
+        ("Swimmer-v5", {}),
+        ("Swimmer-v5", {"exclude_current_positions_from_observation": False}),
+        ("Walker2d-v5", {}),
+        ("FrankaKitchen-v1", EXACT),
+    ],
+)
+def test_qpos_is_read_from_observations_where_they_hold_it_to_the_bit(env_id: str, kwargs: dict[str, Any]) -> None:
+    frames, qpos = observed_alone(env_id, **kwargs)
+    np.testing.assert_array_equal(frames._recorded(0)["qpos"], qpos)
+    assert not frames.describe()["qpos_is_noisy"]
+
+
+def test_the_kitchens_noisy_positions_are_shown_and_told() -> None:
+    frames, qpos = observed_alone("FrankaKitchen-v1")
+    assert 0 < np.abs(frames._recorded(0)["qpos"] - qpos).max() <= 0.001
+    assert frames.describe()["qpos_is_noisy"]
+    assert len(list(frames.read(0))) == len(qpos)
+
+
+def observed_alone(env_id: str, **kwargs: Any) -> tuple[Any, np.ndarray]:
+    """Frames of a dataset without recorded states, and the states (T+1, nq) of its only episode."""
+    env: Any = gymnasium.make(env_id, **kwargs)
     env.action_space.seed(0)
     observation, info = env.reset(seed=0)
     observations, infos, state, actions = [observation], [info], [state_of(env)], []
     for _ in range(3):
         actions.append(env.action_space.sample())
         observation, _, _, _, info = env.step(actions[-1])
-        observations.append(observation)
+        observations.append(copy.deepcopy(observation))
         infos.append(info)
         state.append(state_of(env))
     episode = Episode(observations, [], state, np.array(actions), np.zeros(3))
-    kept = {"x_position": np.array([info["x_position"] for info in infos])} if "x_position" in infos[0] else {}
+    kept = {name: np.array([info[name] for info in infos]) for name in infos[0] if name in ("x_position", "y_position")}
     dataset = write_minari(
         "some/random-v0",
         [episode],
         as_observed,
         space_of(as_observed(episode)),
-        env=env_id,
+        env=env.spec,
         infos=lambda _: kept,
     )
-    frames: Any = open_source(dataset).frames
-    np.testing.assert_array_equal(frames._recorded(0)["qpos"], [one["qpos"] for one in state])
+    return open_source(dataset).frames, np.array([one["qpos"] for one in state])
 
 
 @pytest.mark.parametrize(

@@ -39,23 +39,37 @@ SIZE = 224
 Doubles = NDArray[np.float64]
 Pose = tuple[tuple[float, float, float], float, float, float]
 """Point that a camera looks at and distance from it in metres, azimuth and elevation in degrees."""
-Columns = tuple[tuple[str, int], ...]
-"""Paths within an episode and how many of their first columns make up qpos, in order; -1: all."""
+Columns = tuple[tuple[str, int, int | None], ...]
+"""Paths within an episode and which of their columns make up qpos, in order: from the first number to before the
+second; None: to the end."""
 
 _VERSION = 2  # raise it with any change of this file that changes a pixel: cached embeddings depend on it
 _MAZES = "gymnasium_robotics.envs.maze."
 _ADROIT = "gymnasium_robotics.envs.adroit_hand."
 _FETCH = "gymnasium_robotics.envs.fetch."
+_KITCHEN = "gymnasium_robotics.envs.franka_kitchen"
+_GYMNASIUM = "gymnasium.envs.mujoco."
+_X: Columns = (("infos/x_position", 0, 1),)
+_XY: Columns = (*_X, ("infos/y_position", 0, 1))
 
 IN_OBSERVATIONS: Mapping[str, Columns] = {
-    f"{_MAZES}point_maze": (("observations/observation", 2),),
-    f"{_MAZES}ant_maze": (("observations/achieved_goal", 2), ("observations/observation", 13)),
-    "gymnasium.envs.mujoco.half_cheetah_v5": (("infos/x_position", 1), ("observations", 8)),
-    "gymnasium.envs.mujoco.hopper_v5": (("infos/x_position", 1), ("observations", 5)),
-    "gymnasium.envs.mujoco.walker2d_v5": (("infos/x_position", 1), ("observations", 8)),
+    f"{_MAZES}point_maze": (("observations/observation", 0, 2),),
+    f"{_MAZES}ant_maze": (("observations/achieved_goal", 0, 2), ("observations/observation", 0, 13)),
+    f"{_GYMNASIUM}ant_v5": (*_XY, ("observations", 0, 13)),
+    f"{_GYMNASIUM}half_cheetah_v5": (*_X, ("observations", 0, 8)),
+    f"{_GYMNASIUM}hopper_v5": (*_X, ("observations", 0, 5)),
+    f"{_GYMNASIUM}humanoid_v5": (*_XY, ("observations", 0, 22)),
+    f"{_GYMNASIUM}humanoidstandup_v5": (*_XY, ("observations", 0, 22)),
+    f"{_GYMNASIUM}inverted_pendulum_v5": (("observations", 0, 2),),
+    f"{_GYMNASIUM}swimmer_v5": (*_XY, ("observations", 0, 3)),
+    f"{_GYMNASIUM}walker2d_v5": (*_X, ("observations", 0, 8)),
+    _KITCHEN: (("observations/observation", 0, 9), ("observations/observation", 18, 39)),
 }
-"""Where qpos stands, to the bit, in what environments observe: entry point → columns. Fetch's and Adroit's
-observations do not hold it, so their datasets need the recorded state."""
+"""Where qpos stands in what environments observe: entry point → columns. To the bit, but for the kitchen's `NOISE`.
+Fetch's and Adroit's observations do not hold it, so their datasets need the recorded state."""
+
+NOISE = ("robot_noise_ratio", "object_noise_ratio")
+"""Arguments of FrankaKitchen that blur what it observes: by default by up to 0.001 rad, 0.00005 rad or metres."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +88,8 @@ class States:
     """Of the model; empty: where the environment's own camera stands."""
     pose: Pose | None = None
     """Of that camera."""
+    noisy: bool = False
+    """Whether the observations that qpos is read from were blurred."""
 
     @property
     def views(self) -> Sequence[str]:
@@ -86,6 +102,7 @@ class States:
             "kind": "states",
             "views": list(self.views),
             "qpos_from": [list(column) for column in self.qpos],
+            "qpos_is_noisy": self.noisy,
             "scenery_from": list(self.scenery),
             "camera_pose": self.pose,
             "size": SIZE,
@@ -111,10 +128,7 @@ class States:
         with h5py.File(self.file, "r") as file:
             group = file[self.episodes[episode]]
             n_rows = len(group["actions"]) + 1
-            columns = []
-            for path, n in self.qpos:
-                values = _rows(group, path, n_rows)
-                columns.append(values if n < 0 else values[:, :n])
+            columns = [_rows(group, path, n_rows)[:, first:end] for path, first, end in self.qpos]
             found = {path.rpartition("/")[2]: _rows(group, path, n_rows) for path in self.scenery}
             return {**found, "qpos": np.concatenate(columns, axis=1)}
 
@@ -162,9 +176,11 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
         there = {*infos, *entries(group["observations"], "observations")}
     if len(recorded) > 1:
         raise BadInput(f"{what} records several states ({', '.join(recorded)}); remove all but one")
-    columns: Columns | None = ((recorded[0], -1),) if recorded else None
-    if columns is None and kwargs.get("exclude_current_positions_from_observation", True):
+    columns: Columns | None = ((recorded[0], 0, None),) if recorded else None
+    if columns is None:
         columns = next((found for start, found in IN_OBSERVATIONS.items() if entry_point.startswith(start)), None)
+        if columns is not None and not kwargs.get("exclude_current_positions_from_observation", True):
+            columns = (("observations", 0, sum((end or 0) - first for _, first, end in columns)),)
         if columns is not None and spec.get("additional_wrappers"):
             wrappers = ", ".join(str(wrapper.get("name")) for wrapper in spec["additional_wrappers"])
             raise BadInput(
@@ -181,13 +197,14 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
     stage = stage_of(env_spec, tuple(cameras))
     folder = columns[0][0].rpartition("/")[0]
     scenery = tuple(path.format(folder=folder) for path in stage.scenery)
-    missing = [path for path in (*scenery, *(path for path, _ in columns)) if path not in there]
+    missing = [path for path in (*scenery, *(path for path, *_ in columns)) if path not in there]
     if missing:
         raise BadInput(
             f"{what} lacks {', '.join(missing)}: {spec.get('id')} puts things elsewhere in each episode, and frames "
             "without that would be wrong. Record it, or give --frames FOLDER"
         )
-    states = States(file, tuple(episodes), env_spec, columns, scenery, tuple(cameras))
+    noisy = not recorded and entry_point.startswith(_KITCHEN) and any(kwargs.get(name, 1) for name in NOISE)
+    states = States(file, tuple(episodes), env_spec, columns, scenery, tuple(cameras), noisy=noisy)
     start = {name: values[0] for name, values in states._recorded(0).items()}
     if len(start["qpos"]) != stage.model.nq:
         raise BadInput(
