@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import shutil
+import sys
 import tempfile
 import tracemalloc
 from collections.abc import Callable, Iterator
@@ -663,6 +664,63 @@ def test_embeddings_of_states_are_cached_by_the_compiled_model(maze: list[Episod
         stage_of.cache_clear()
         digests.append(open_source(dataset).frames.digest(0))
     assert digests[0] == digests[2] != digests[1]
+
+
+OWN_ROBOT = """
+import gymnasium
+import numpy as np
+from gymnasium.envs.mujoco.reacher_v5 import ReacherEnv
+
+class OwnReacher(ReacherEnv):
+    pass
+
+gymnasium.register("OwnReacher-v0", entry_point="own_robot:OwnReacher", max_episode_steps=50)
+
+def qpos(arrays):
+    cos, sin, target = np.split(arrays["observations"][:, :6], 3, axis=1)
+    return np.concatenate([np.arctan2(sin, cos), target], axis=1)
+
+def short(arrays):
+    return qpos(arrays)[1:]
+"""
+
+
+def test_another_package_rebuilds_the_states_of_its_own_environment(
+    goal: Path,
+    zest: Run,
+    refusal: Callable[..., tuple[int, str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    site = tmp_path / "site"
+    about = site / "own_robot-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: own_robot\nVersion: 1.0\n")
+    (site / "own_robot.py").write_text(OWN_ROBOT)
+    episodes = roll_out("Reacher-v5", (3, 3))
+    dataset = write_states("own/random-v0", "Reacher-v5", episodes, with_state=False)
+    edit_spec(dataset, id="OwnReacher-v0", entry_point="own_robot:OwnReacher")
+    words = ["relabel", dataset, "--goal", goal, "--n-workers", "1"]
+    monkeypatch.syspath_prepend(str(site))
+    code, error = refusal(*words)
+    assert (code, "would run code of 'own_robot:OwnReacher'" in error) == (2, True)
+    assert "own_robot" not in sys.modules
+
+    def register(function: str) -> None:
+        entry = f"[zest_rl.state_renderers]\nOwnReacher-v0 = own_robot:{function}\n"
+        (about / "entry_points.txt").write_text(entry)
+
+    register("qpos")
+    made = zest(*words)["dataset"]
+    assert data.read_metadata(made)["zest"]["relabel"]["frames"]["qpos_from"] == "own_robot:qpos"
+    frames: Any = open_source(dataset).frames
+    for i, episode in enumerate(episodes):
+        np.testing.assert_allclose(frames._recorded(i)["qpos"], [state["qpos"] for state in episode.state], atol=1e-6)
+    for function, message in (("short", "qpos must be finite and of shape (4, nq), got (3, 4)"), ("lost", "lost")):
+        register(function)
+        code, error = refusal(*words)
+        assert (code, f"own_robot:{function}, which is registered for OwnReacher-v0, failed" in error) == (1, True)
+        assert message in error
 
 
 # --- a folder beside the dataset --------------------------------------------------------------------------------------

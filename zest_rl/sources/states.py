@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import atexit
 import functools
+import importlib
 import importlib.metadata
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr
 from dataclasses import dataclass, replace
+from importlib.metadata import EntryPoint
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -32,6 +34,7 @@ from zest_rl.envs import check_registered
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.observations import entries
 from zest_rl.rendering import Canvas
+from zest_rl.sources import own_states
 from zest_rl.types import Frame
 
 SIZE = 224
@@ -82,6 +85,7 @@ class States:
     env_spec: str
     """Of the environment, as JSON, checked."""
     qpos: Columns
+    """None: another package rebuilds it (`own_states`)."""
     scenery: tuple[str, ...]
     """Paths of what else is put into the scene."""
     cameras: tuple[str, ...] = ()
@@ -101,7 +105,7 @@ class States:
         return {
             "kind": "states",
             "views": list(self.views),
-            "qpos_from": [list(column) for column in self.qpos],
+            "qpos_from": [list(column) for column in self.qpos] or self._own.value,
             "qpos_is_noisy": self.noisy,
             "scenery_from": list(self.scenery),
             "camera_pose": self.pose,
@@ -128,9 +132,18 @@ class States:
         with h5py.File(self.file, "r") as file:
             group = file[self.episodes[episode]]
             n_rows = len(group["actions"]) + 1
-            columns = [_rows(group, path, n_rows)[:, first:end] for path, first, end in self.qpos]
             found = {path.rpartition("/")[2]: _rows(group, path, n_rows) for path in self.scenery}
+            if not self.qpos:
+                return {**found, "qpos": own_states.rebuild(self._own, group, n_rows)}
+            columns = [_rows(group, path, n_rows)[:, first:end] for path, first, end in self.qpos]
             return {**found, "qpos": np.concatenate(columns, axis=1)}
+
+    @property
+    def _own(self) -> EntryPoint:
+        entry = own_states.registered(json.loads(self.env_spec)["id"])
+        if entry is None:
+            raise ZestError("the package that rebuilds the states is not installed on this machine; install it")
+        return entry
 
 
 _DEFAULT_CAMERA = "the environment's own camera"
@@ -166,17 +179,19 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
             f"{what} shows no frames: there are no pictures to choose, and it names no environment whose recorded "
             "states could be rendered; give --frames FOLDER with a video of each episode"
         )
-    check_env_spec(env_spec, f"the env_spec of {what}", "; give --frames FOLDER with a video of each episode")
     spec = json.loads(env_spec)
+    own = own_states.registered(str(spec.get("id")))
+    if own is None:
+        check_env_spec(env_spec, f"the env_spec of {what}", "; give --frames FOLDER with a video of each episode")
     entry_point, kwargs = str(spec["entry_point"]), spec.get("kwargs") or {}
     with h5py.File(file, "r") as opened:
         group = opened[episodes[0]]
         infos = entries(group["infos"], "infos") if "infos" in group else {}
         recorded = [path for path in infos if path.rpartition("/")[2] == "qpos"]
         there = {*infos, *entries(group["observations"], "observations")}
-    if len(recorded) > 1:
+    if len(recorded) > 1 and own is None:
         raise BadInput(f"{what} records several states ({', '.join(recorded)}); remove all but one")
-    columns: Columns | None = ((recorded[0], 0, None),) if recorded else None
+    columns: Columns | None = () if own else ((recorded[0], 0, None),) if recorded else None
     if columns is None:
         columns = next((found for start, found in IN_OBSERVATIONS.items() if entry_point.startswith(start)), None)
         if columns is not None and not kwargs.get("exclude_current_positions_from_observation", True):
@@ -195,7 +210,7 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
             "FOLDER with a video of each episode"
         )
     stage = stage_of(env_spec, tuple(cameras))
-    folder = columns[0][0].rpartition("/")[0]
+    folder = columns[0][0].rpartition("/")[0] if columns else "infos/state"
     scenery = tuple(path.format(folder=folder) for path in stage.scenery)
     missing = [path for path in (*scenery, *(path for path, *_ in columns)) if path not in there]
     if missing:
@@ -286,6 +301,9 @@ def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
         spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
     except (ValueError, KeyError, TypeError) as error:
         raise BadInput(f"the dataset's env_spec is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
+    own = own_states.registered(spec.id)
+    if own is not None and spec.id not in gymnasium.registry:
+        importlib.import_module(own.module)  # it registers the environment
     check_registered(spec)
     spec.additional_wrappers = ()  # what they change is not shown, and they are code
     try:
