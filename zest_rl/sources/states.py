@@ -215,8 +215,8 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
     missing = [path for path in (*scenery, *(path for path, *_ in columns)) if path not in there]
     if missing:
         raise BadInput(
-            f"{what} lacks {', '.join(missing)}: {spec.get('id')} puts things elsewhere in each episode, and frames "
-            "without that would be wrong. Record it, or give --frames FOLDER"
+            f"{what} lacks {', '.join(missing)}, without which frames of {spec.get('id')} would be wrong. Record it, "
+            "or give --frames FOLDER with a video of each episode"
         )
     noisy = not recorded and entry_point.startswith(_KITCHEN) and any(kwargs.get(name, 1) for name in NOISE)
     states = States(file, tuple(episodes), env_spec, columns, scenery, tuple(cameras), noisy=noisy)
