@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import shutil
+import sys
 import tempfile
 import tracemalloc
 from collections.abc import Callable, Iterator
@@ -23,6 +25,7 @@ import pyarrow
 import pyarrow.parquet
 import pytest
 from gymnasium import spaces
+from gymnasium_robotics.utils import mujoco_utils
 from minari.data_collector import EpisodeBuffer
 from PIL import Image
 
@@ -263,6 +266,29 @@ def test_the_only_camera_is_found_by_itself_also_as_jpeg_in_a_flat_observation(
         np.testing.assert_allclose(scores, expected_scores([list(episode.observations)], goal), atol=1e-4)
 
 
+def test_rewards_need_not_be_recorded(pictured: str, goal: Path, zest: Run, tmp_path: Path) -> None:
+    words = ["--goal", goal, "--frames", "cameras/top", "--n-workers", "1"]
+    with h5py.File(data.dataset_path(pictured) / data.DATA_FILE, "r+") as file:
+        for episode in file.values():
+            del episode["rewards"]
+    made = zest("relabel", pictured, *words)["dataset"]
+    for scores, found in zip(data.read_scores(made), minari.load_dataset(made), strict=True):
+        np.testing.assert_array_equal(found.rewards, scores[1:])
+        assert "source" not in found.infos
+    zest("export", made, "--output", tmp_path / "maze.npz")
+    assert "source_reward" not in np.load(tmp_path / "maze.npz")
+
+
+def test_episodes_that_minari_could_not_read_are_refused_before_any_work(
+    pictured: str, goal: Path, refusal: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    with h5py.File(data.dataset_path(pictured) / data.DATA_FILE, "r+") as file:
+        del file["episode_1"]
+    code, error = refusal("relabel", pictured, "--goal", goal, "--frames", "cameras/top")
+    assert (code, "must hold episode_0, … episode_1, as Minari needs it" in error) == (2, True)
+    assert not (tmp_path / "cache" / "frames").exists()
+
+
 def test_the_metadata_tells_where_the_frames_came_from(pictured: str, goal: Path, zest: Run) -> None:
     made = zest("relabel", pictured, "--goal", goal, "--frames", "cameras/top")["dataset"]
     facts = data.read_metadata(made)["zest"]["relabel"]
@@ -387,11 +413,15 @@ def recorded(episode: Episode) -> dict[str, Any]:
     return {"state": {key: np.stack([state[key] for state in episode.state]) for key in episode.state[0]}}
 
 
+def stacked(values: list[Any]) -> Any:
+    """Rows of an array, or of those in a dict."""
+    if isinstance(values[0], dict):
+        return {key: stacked([value[key] for value in values]) for key in values[0]}
+    return np.stack(values)
+
+
 def as_observed(episode: Episode) -> Any:
-    first = episode.observations[0]
-    if isinstance(first, dict):
-        return {key: rows(episode, key) for key in first}
-    return np.stack(episode.observations)
+    return stacked(episode.observations)
 
 
 def write_states(dataset_id: str, env_id: str, episodes: list[Episode], *, with_state: bool = True) -> str:
@@ -402,21 +432,58 @@ def write_states(dataset_id: str, env_id: str, episodes: list[Episode], *, with_
 
 def rendered(env_id: str, camera: str | None, episode: Episode, seed: int) -> list[Frame]:
     """The same states in an environment of their own, through Gymnasium's own renderer."""
-    env: Any = gymnasium.make(env_id, render_mode="rgb_array", width=224, height=224, camera_name=camera)
-    quality = env.unwrapped.model.vis.quality
-    quality.shadowsize = quality.offsamples = 0
+    chosen = {} if camera is None else {"camera_name": camera}
+    env: Any = gymnasium.make(env_id, render_mode="rgb_array", width=224, height=224, **chosen)
+    bare = env.unwrapped
+    bare.model.vis.quality.shadowsize = bare.model.vis.quality.offsamples = 0
     env.reset(seed=seed)
-    renderer = env.unwrapped.mujoco_renderer
-    frames = [env.render()]
-    flags = renderer.viewer.scn.flags
+    env.render()
+    inner = next((part for name in ("point_env", "ant_env", "robot_env") if (part := getattr(bare, name, None))), bare)
+    flags = inner.mujoco_renderer.viewer.scn.flags
     for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_SKYBOX):
         flags[flag] = False
-    frames = [env.render()]
-    for state in episode.state[1:]:  # after a step, Gymnasium shows positions of one substep before
-        env.unwrapped.set_state(state["qpos"], state["qvel"])
+    frames = []
+    for state in episode.state:  # after a step, Gymnasium shows positions of one substep before
+        bare.data.qpos[:] = state["qpos"]
+        mujoco.mj_forward(bare.model, bare.data)
+        if bare.model.nmocap:  # Fetch's gripper is pulled along by one
+            mujoco_utils.reset_mocap2body_xpos(bare.model, bare.data)
         frames.append(env.render())
     env.close()
     return frames
+
+
+@pytest.mark.parametrize(
+    "env_id",
+    [
+        "AdroitHandPen-v1",
+        "AdroitHandDoor-v1",
+        "FetchReach-v4",
+        "PointMaze_UMaze-v3",
+        "AntMaze_UMaze-v5",
+        "HalfCheetah-v5",
+        "Humanoid-v5",
+        "Reacher-v5",
+        "FrankaKitchen-v1",
+    ],
+)
+def test_without_a_camera_frames_are_those_that_the_environment_renders(env_id: str) -> None:
+    (episode,) = roll_out(env_id, (3,))
+    source = open_source(write_states("some/random-v0", env_id, [episode]))
+    ours = [views[0] for views in source.frames.read(0)]
+    np.testing.assert_array_equal(ours, rendered(env_id, None, episode, seed=0))
+    assert max(np.std(frame) for frame in ours) > 10, "it shows something"
+
+
+def test_the_environments_own_camera_stays_where_it_stood_at_first_and_embeddings_depend_on_it() -> None:
+    episodes = roll_out("HalfCheetah-v5", (2, 2))
+    both = open_source(write_states("cheetah/both-v0", "HalfCheetah-v5", episodes)).frames
+    last = open_source(write_states("cheetah/last-v0", "HalfCheetah-v5", episodes[1:])).frames
+    assert both.describe()["camera_pose"][1] == 4.0, "metres, of the environment's default_camera_config"
+    assert both.describe()["camera_pose"] != last.describe()["camera_pose"]
+    assert both.digest(1) != last.digest(0), "the same states, seen from elsewhere"
+    cameras = [open_source(f"cheetah/{name}-v0", cameras=["track"]).frames for name in ("both", "last")]
+    assert cameras[0].digest(1) == cameras[1].digest(0)
 
 
 def test_states_are_rendered_as_the_environment_itself_shows_them_with_the_door_where_it_stood(
@@ -434,7 +501,7 @@ def test_states_are_rendered_as_the_environment_itself_shows_them_with_the_door_
     assert result["views"] == ["fixed", "vil_camera"]
     check_kept_but_the_rewards(dataset, result["dataset"])
     facts = data.read_metadata(result["dataset"])["zest"]["relabel"]["frames"]
-    assert facts["qpos_from"] == [["infos/state/qpos", -1]]
+    assert facts["qpos_from"] == [["infos/state/qpos", 0, None]]
     assert facts["scenery_from"] == ["infos/state/door_body_pos"]
     code, error = refusal("relabel", dataset, "--goal", goal, "--camera", "fixd")
     assert (code, "has no camera 'fixd'; did you mean 'fixed'?" in error) == (2, True)
@@ -459,30 +526,62 @@ def test_the_target_of_fetch_is_where_the_goal_is_and_its_joints_must_be_recorde
     assert "observations of FetchReach-v4 do not hold it to the bit. Record infos/state/qpos, or give --frames" in error
 
 
-@pytest.mark.parametrize("env_id", ["PointMaze_UMaze-v3", "AntMaze_UMaze-v5", "HalfCheetah-v5"])
-def test_qpos_is_read_from_observations_where_they_hold_it_to_the_bit(env_id: str) -> None:
-    env: Any = gymnasium.make(env_id)
+EXACT = {"robot_noise_ratio": 0.0, "object_noise_ratio": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kwargs"),
+    [
+        ("PointMaze_UMaze-v3", {}),
+        ("AntMaze_UMaze-v5", {}),
+        ("Ant-v5", {}),
+        ("HalfCheetah-v5", {}),
+        ("Hopper-v5", {}),
+        ("Humanoid-v5", {}),
+        ("HumanoidStandup-v5", {}),
+        ("InvertedPendulum-v5", {}),
+        ("Swimmer-v5", {}),
+        ("Swimmer-v5", {"exclude_current_positions_from_observation": False}),
+        ("Walker2d-v5", {}),
+        ("FrankaKitchen-v1", EXACT),
+    ],
+)
+def test_qpos_is_read_from_observations_where_they_hold_it_to_the_bit(env_id: str, kwargs: dict[str, Any]) -> None:
+    frames, qpos = observed_alone(env_id, **kwargs)
+    np.testing.assert_array_equal(frames._recorded(0)["qpos"], qpos)
+    assert not frames.describe()["qpos_is_noisy"]
+
+
+def test_the_kitchens_noisy_positions_are_shown_and_told() -> None:
+    frames, qpos = observed_alone("FrankaKitchen-v1")
+    assert 0 < np.abs(frames._recorded(0)["qpos"] - qpos).max() <= 0.001
+    assert frames.describe()["qpos_is_noisy"]
+    assert len(list(frames.read(0))) == len(qpos)
+
+
+def observed_alone(env_id: str, **kwargs: Any) -> tuple[Any, np.ndarray]:
+    """Frames of a dataset without recorded states, and the states (T+1, nq) of its only episode."""
+    env: Any = gymnasium.make(env_id, **kwargs)
     env.action_space.seed(0)
     observation, info = env.reset(seed=0)
     observations, infos, state, actions = [observation], [info], [state_of(env)], []
     for _ in range(3):
         actions.append(env.action_space.sample())
         observation, _, _, _, info = env.step(actions[-1])
-        observations.append(observation)
+        observations.append(copy.deepcopy(observation))
         infos.append(info)
         state.append(state_of(env))
     episode = Episode(observations, [], state, np.array(actions), np.zeros(3))
-    kept = {"x_position": np.array([info["x_position"] for info in infos])} if "x_position" in infos[0] else {}
+    kept = {name: np.array([info[name] for info in infos]) for name in infos[0] if name in ("x_position", "y_position")}
     dataset = write_minari(
         "some/random-v0",
         [episode],
         as_observed,
         space_of(as_observed(episode)),
-        env=env_id,
+        env=env.spec,
         infos=lambda _: kept,
     )
-    frames: Any = open_source(dataset).frames
-    np.testing.assert_array_equal(frames._recorded(0)["qpos"], [one["qpos"] for one in state])
+    return open_source(dataset).frames, np.array([one["qpos"] for one in state])
 
 
 @pytest.mark.parametrize(
@@ -500,8 +599,30 @@ def test_code_that_is_not_the_registered_environments_is_not_run(
 def edit_spec(dataset: str, **changes: Any) -> None:
     path = data.dataset_path(dataset) / data.METADATA_FILE
     metadata = json.loads(path.read_text())
-    metadata["env_spec"] = json.dumps(json.loads(metadata["env_spec"]) | changes)
+    spec = json.loads(metadata.get("env_spec") or gymnasium.spec("PointMaze_UMaze-v3").to_json())
+    metadata["env_spec"] = json.dumps(spec | changes)
     path.write_text(json.dumps(metadata))
+
+
+@pytest.mark.parametrize("entry_point", ["ale_py.env:AtariEnv", "my_robot.envs:MyRobotEnv"])
+def test_pictures_of_any_environment_are_taken_for_it_is_never_built(
+    entry_point: str,
+    pictured: str,
+    maze: list[Episode],
+    goal: Path,
+    zest: Run,
+    refusal: Callable[..., tuple[int, str]],
+    tmp_path: Path,
+) -> None:
+    edit_spec(pictured, id="Robot-v0", entry_point=entry_point)
+    made = zest("relabel", pictured, "--goal", goal, "--frames", "cameras/top", "--n-workers", "1")["dataset"]
+    assert zest("inspect", made, "--output", tmp_path / "page.html")["datasets"].keys() == {made}
+    assert zest("export", made, "--output", tmp_path / "maze.npz")["n_transitions"] == sum(LENGTHS)
+    states = write_states("maze/random-v0", "PointMaze_UMaze-v3", maze)
+    edit_spec(states, id="Robot-v0", entry_point=entry_point)
+    code, error = refusal("relabel", states, "--goal", goal)
+    assert (code, f"would run code of {entry_point!r}; only gymnasium.*" in error) == (2, True)
+    assert "are trusted; give --frames FOLDER" in error
 
 
 def test_an_env_spec_that_is_none_is_refused(
@@ -543,6 +664,63 @@ def test_embeddings_of_states_are_cached_by_the_compiled_model(maze: list[Episod
         stage_of.cache_clear()
         digests.append(open_source(dataset).frames.digest(0))
     assert digests[0] == digests[2] != digests[1]
+
+
+OWN_ROBOT = """
+import gymnasium
+import numpy as np
+from gymnasium.envs.mujoco.reacher_v5 import ReacherEnv
+
+class OwnReacher(ReacherEnv):
+    pass
+
+gymnasium.register("OwnReacher-v0", entry_point="own_robot:OwnReacher", max_episode_steps=50)
+
+def qpos(arrays):
+    cos, sin, target = np.split(arrays["observations"][:, :6], 3, axis=1)
+    return np.concatenate([np.arctan2(sin, cos), target], axis=1)
+
+def short(arrays):
+    return qpos(arrays)[1:]
+"""
+
+
+def test_another_package_rebuilds_the_states_of_its_own_environment(
+    goal: Path,
+    zest: Run,
+    refusal: Callable[..., tuple[int, str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    site = tmp_path / "site"
+    about = site / "own_robot-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: own_robot\nVersion: 1.0\n")
+    (site / "own_robot.py").write_text(OWN_ROBOT)
+    episodes = roll_out("Reacher-v5", (3, 3))
+    dataset = write_states("own/random-v0", "Reacher-v5", episodes, with_state=False)
+    edit_spec(dataset, id="OwnReacher-v0", entry_point="own_robot:OwnReacher")
+    words = ["relabel", dataset, "--goal", goal, "--n-workers", "1"]
+    monkeypatch.syspath_prepend(str(site))
+    code, error = refusal(*words)
+    assert (code, "would run code of 'own_robot:OwnReacher'" in error) == (2, True)
+    assert "own_robot" not in sys.modules
+
+    def register(function: str) -> None:
+        entry = f"[zest_rl.state_renderers]\nOwnReacher-v0 = own_robot:{function}\n"
+        (about / "entry_points.txt").write_text(entry)
+
+    register("qpos")
+    made = zest(*words)["dataset"]
+    assert data.read_metadata(made)["zest"]["relabel"]["frames"]["qpos_from"] == "own_robot:qpos"
+    frames: Any = open_source(dataset).frames
+    for i, episode in enumerate(episodes):
+        np.testing.assert_allclose(frames._recorded(i)["qpos"], [state["qpos"] for state in episode.state], atol=1e-6)
+    for function, message in (("short", "qpos must be finite and of shape (4, nq), got (3, 4)"), ("lost", "lost")):
+        register(function)
+        code, error = refusal(*words)
+        assert (code, f"own_robot:{function}, which is registered for OwnReacher-v0, failed" in error) == (1, True)
+        assert message in error
 
 
 # --- a folder beside the dataset --------------------------------------------------------------------------------------
@@ -695,7 +873,7 @@ def test_other_files_are_refused(
 # --- LeRobot ----------------------------------------------------------------------------------------------------------
 
 
-def write_lerobot(root: Path, maze: list[Episode], *, version: str = "v3.0") -> Path:
+def write_lerobot(root: Path, maze: list[Episode], *, version: str = "v3.0", number: int = 0, step: int = 1) -> Path:
     """The layout of https://huggingface.co/docs/lerobot/lerobot-dataset-v3: two episodes in the first files."""
     fps, key = 10, "observation.images.top"
     rows_of, first = [], 0
@@ -710,7 +888,7 @@ def write_lerobot(root: Path, maze: list[Episode], *, version: str = "v3.0") -> 
                 "next.truncated": [False] * n_steps,
                 "timestamp": (np.arange(n_steps) / fps).astype(np.float32).tolist(),
                 "frame_index": list(range(n_steps)),
-                "episode_index": [i] * n_steps,
+                "episode_index": [number + step * i] * n_steps,
                 "index": list(range(first, first + n_steps)),
                 "task_index": [0] * n_steps,
             }
@@ -731,7 +909,7 @@ def write_lerobot(root: Path, maze: list[Episode], *, version: str = "v3.0") -> 
             place = {"chunk_index": 0, "file_index": file}
             listed.append(
                 {
-                    "episode_index": i,
+                    "episode_index": number + step * i,
                     "tasks": ["go there"],
                     "length": length,
                     **{f"data/{name}": value for name, value in place.items()},
@@ -745,12 +923,12 @@ def write_lerobot(root: Path, maze: list[Episode], *, version: str = "v3.0") -> 
     (root / "meta" / "episodes" / "chunk-000").mkdir(parents=True)
     table = pyarrow.Table.from_pylist(listed)
     pyarrow.parquet.write_table(table, root / "meta" / "episodes" / "chunk-000" / "file-000.parquet")
-    number = {"dtype": "float32", "names": None}
+    one = {"dtype": "float32", "names": None}
     features = {
         key: {"dtype": "video", "shape": [SIDE, SIDE, 3], "info": {"video.is_depth_map": False}},
-        "observation.state": {**number, "shape": [4]},
-        "action": {**number, "shape": [2]},
-        "next.reward": {**number, "shape": [1]},
+        "observation.state": {**one, "shape": [4]},
+        "action": {**one, "shape": [2]},
+        "next.reward": {**one, "shape": [1]},
         "next.done": {"dtype": "bool", "shape": [1]},
         "next.truncated": {"dtype": "bool", "shape": [1]},
         "episode_index": {"dtype": "int64", "shape": [1]},
@@ -791,6 +969,22 @@ def test_a_lerobot_folder_becomes_a_minari_dataset(
     videos[1].unlink()
     code, error = refusal("relabel", root, "--goal", goal)
     assert (code, "lacks videos/observation.images.top/chunk-000/file-001.mp4" in error) == (2, True)
+
+
+def test_a_part_of_a_lerobot_dataset_keeps_its_order_whatever_its_numbers(
+    maze: list[Episode], goal: Path, zest: Run, refusal: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    folders = write_lerobot(tmp_path / "whole", maze), write_lerobot(tmp_path / "part", maze, number=3, step=2)
+    whole, part = (open_source(str(folder)) for folder in folders)
+    assert part.trajectories.fingerprint() == whole.trajectories.fingerprint()
+    for i in range(len(maze)):
+        np.testing.assert_array_equal(list(part.frames.read(i)), list(whole.frames.read(i)))
+    made = zest("relabel", tmp_path / "part", "--goal", goal, "--n-workers", "1")["dataset"]
+    assert [len(rewards) for rewards in data.read_rewards(made)] == list(LENGTHS)
+    listed = tmp_path / "part" / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    shutil.copyfile(listed, listed.with_name("file-001.parquet"))
+    code, error = refusal("relabel", tmp_path / "part", "--goal", goal)
+    assert (code, "must list every episode once, got 6 rows" in error) == (2, True)
 
 
 def test_an_older_lerobot_dataset_is_refused_with_what_converts_it(

@@ -77,8 +77,10 @@ def exists(dataset_id: str) -> bool:
 def read_metadata(dataset_id: str) -> dict[str, Any]:
     """Return a dataset's metadata after checking that its files are as they were written.
 
+    Whoever builds an environment from them calls `check_env_spec` first; reading runs no code of it.
+
     Raises:
-        BadInput: no such dataset (the nearest are named), or its environment's code is not of a trusted package.
+        BadInput: no such dataset (the nearest are named), or an env_spec in it is none.
         ZestError: a file was damaged or changed since it was written.
     """
     folder = dataset_path(dataset_id)
@@ -98,26 +100,30 @@ def read_metadata(dataset_id: str) -> dict[str, Any]:
     metadata: dict[str, Any] = artifacts.read_json(folder / METADATA_FILE)
     for key in ("env_spec", "eval_env_spec"):
         if metadata.get(key):
-            check_env_spec(metadata[key], f"the {key} of dataset {dataset_id}")
+            _entry_points(metadata[key], f"the {key} of dataset {dataset_id}")
     return metadata
 
 
-def check_env_spec(env_spec: str, what: str) -> None:
+def _entry_points(env_spec: str, what: str) -> list[str]:
+    """Return the code that a Gymnasium EnvSpec (JSON) would run: of its environment, and of wrappers."""
+    try:
+        spec = json.loads(env_spec)
+        return [str(part["entry_point"]) for part in (spec, *spec.get("additional_wrappers", ()))]
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise BadInput(f"{what} is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
+
+
+def check_env_spec(env_spec: str, what: str, instead: str = "") -> None:
     """Refuse a Gymnasium EnvSpec (JSON) that would run code of an unknown package: of its environment or a wrapper.
 
     Raises:
-        BadInput: such an entry point, or not an EnvSpec; `what` names it in the message.
+        BadInput: such an entry point, or not an EnvSpec; `what` names it in the message, `instead` ends it.
     """
-    try:
-        spec = json.loads(env_spec)
-        entry_points = [str(part["entry_point"]) for part in (spec, *spec.get("additional_wrappers", ()))]
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise BadInput(f"{what} is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
-    for entry_point in entry_points:
+    for entry_point in _entry_points(env_spec, what):
         if not entry_point.startswith(TRUSTED_ENTRY_POINTS):
             raise BadInput(
                 f"{what} would run code of {entry_point!r}; only {', '.join(p + '*' for p in TRUSTED_ENTRY_POINTS)} "
-                "are trusted. Remove it from metadata.json if you do not need the environment"
+                f"are trusted{instead}"
             )
 
 
@@ -130,9 +136,14 @@ def _open(dataset_id: str) -> Iterator[tuple[h5py.File, list[str]]]:
     except OSError as error:
         raise BadInput(f"dataset {dataset_id} cannot be read as HDF5 ({error}); only that storage is read") from error
     with file:
-        names = sorted(file, key=lambda name: int(name.removeprefix("episode_")))
+        names = [f"episode_{i}" for i in range(len(file))]
         if not names:
             raise BadInput(f"dataset {dataset_id} has no episodes; collect it again")
+        if missing := [name for name in names if name not in file]:
+            raise BadInput(
+                f"dataset {dataset_id} must hold {names[0]}, … {names[-1]}, as Minari needs it, but {missing[0]} "
+                f"is missing from its {len(file)} groups; rename them, and set total_episodes in metadata.json"
+            )
         yield file, names
 
 
@@ -194,6 +205,22 @@ def read_episodes(dataset_id: str) -> list[Episode]:
             rewards=_array(group, "rewards", np.float32, dataset_id),
             terminated=bool(len(ends) and ends[-1]),
         )
+
+    return _each(dataset_id, read)
+
+
+def read_lengths(dataset_id: str) -> list[int]:
+    """Read T of every episode; rewards need not be recorded.
+
+    Raises:
+        BadInput: no such dataset, or rewards of another length.
+    """
+
+    def read(group: h5py.Group) -> int:
+        n_steps = len(_array(group, "terminations", bool, dataset_id))
+        if "rewards" in group and len(group["rewards"]) != n_steps:
+            raise BadInput(f"rewards must be as many as terminations, {n_steps}, got {len(group['rewards'])}")
+        return n_steps
 
     return _each(dataset_id, read)
 
@@ -268,14 +295,15 @@ def read_source_rewards(dataset_id: str) -> list[FloatArray] | None:
 
 
 def rewards_to_keep(dataset_id: str) -> list[FloatArray | None]:
-    """Read the rewards (T,) of every episode that a relabeled copy keeps as its source's; None: the ground truth is."""
+    """Read the rewards (T,) of every episode that a relabeled copy keeps as its source's; None: none are there, or it
+    keeps the ground truth."""
 
     def read(group: h5py.Group) -> FloatArray | None:
         if _GT_REWARD in group:
             return None
         if SOURCE_REWARD in group:
             return _array(group, SOURCE_REWARD, np.float32, dataset_id)[1:]
-        return _array(group, "rewards", np.float32, dataset_id)
+        return _array(group, "rewards", np.float32, dataset_id) if "rewards" in group else None
 
     return _each(dataset_id, read)
 
@@ -284,7 +312,6 @@ def fingerprint(dataset_id: str) -> str:
     """Hash what relabeling and training may see of a dataset: observations, actions, ends and states; no rewards."""
 
     def digest(group: h5py.Group) -> str:
-        _array(group, "rewards", np.float32, dataset_id)
         if "observations" not in group:
             raise BadInput(f"dataset {dataset_id} has no 'observations' in {group.name}")
         actions = _array(group, "actions", np.float32, dataset_id)

@@ -29,8 +29,8 @@ from zest_rl.data import (
     dataset_path,
     exists,
     fingerprint,
+    read_lengths,
     read_metadata,
-    read_rewards,
     rewards_to_keep,
 )
 from zest_rl.errors import BadInput, ZestError
@@ -259,7 +259,7 @@ class Copied:
     @cached_property
     def n_steps(self) -> Sequence[int]:
         """T of every episode."""
-        return [len(rewards) for rewards in read_rewards(self.dataset_id)]
+        return read_lengths(self.dataset_id)
 
     @property
     def n_bytes(self) -> int:
@@ -317,7 +317,7 @@ def write_relabeled(
     extra: Callable[[Path], None],
 ) -> Path:
     """Write a copy of a Minari dataset with other rewards: `write_scored` of its trajectories."""
-    read_metadata(source_id)  # its files are whole, its environment is trusted
+    read_metadata(source_id)  # its files are whole
     return write_scored(Copied(source_id), dataset_id, rewards, scores, description=description, zest=zest, extra=extra)
 
 

@@ -43,7 +43,7 @@ class Rows:
 
     root: Path
     files: tuple[tuple[str, tuple[int, ...]], ...]
-    """Data files, relative to the root, with the episodes in each, in order."""
+    """Data files, relative to the root, with the ``episode_index`` of each that is read from it, in order."""
     n_steps: tuple[int, ...]
     """T of every episode."""
     observed: tuple[str, ...]
@@ -85,15 +85,16 @@ class Rows:
         import pyarrow.compute
         import pyarrow.parquet
 
+        lengths = iter(self.n_steps)
         for file, members in self.files:
             path = self.root / file
             table = pyarrow.parquet.read_table(path, columns=["episode_index", *self.observed, *self.others])
             for episode in members:
                 rows = table.filter(pyarrow.compute.equal(table["episode_index"], episode))
-                if len(rows) != self.n_steps[episode]:
+                if len(rows) != (length := next(lengths)):
                     raise BadInput(
-                        f"{path} has {len(rows)} rows of episode {episode}, but meta/episodes says "
-                        f"{self.n_steps[episode]}; download the dataset again"
+                        f"{path} has {len(rows)} rows of episode {episode}, but meta/episodes says {length}; download "
+                        "the dataset again"
                     )
                 yield self._episode({name: _column(rows[name]) for name in (*self.observed, *self.others)})
 
@@ -212,8 +213,10 @@ def open_lerobot(root: Path, keys: Sequence[str], *, with_frames: bool = True) -
         parts = [pyarrow.parquet.read_table(p, columns=columns) for p in sorted(root.glob("meta/episodes/*/*.parquet"))]
         episodes = sorted((row for part in parts for row in part.to_pylist()), key=lambda row: row["episode_index"])
         n_steps = tuple(int(row["length"]) for row in episodes)
-        if not episodes or [row["episode_index"] for row in episodes] != list(range(len(episodes))):
-            raise BadInput(f"{root}/meta/episodes must list episodes 0, 1, …; got {len(episodes)} rows")
+        if not episodes or len({row["episode_index"] for row in episodes}) < len(episodes):
+            raise BadInput(
+                f"{root}/meta/episodes must list every episode once, got {len(episodes)} rows; download it again"
+            )
         by_file = groupby(episodes, lambda row: _path(info["data_path"], row, "data"))
         files = tuple((file, tuple(row["episode_index"] for row in rows)) for file, rows in by_file)
         spans = tuple(
