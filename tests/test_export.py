@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import h5py
+import minari
 import numpy as np
 import pytest
+from gymnasium import spaces
+from minari.data_collector import EpisodeBuffer
 from pyarrow import parquet
 
 from zest_rl import cli, data
@@ -20,6 +24,56 @@ from zest_rl.export import Rewards, export, transitions
 from zest_rl.frames import Views
 from zest_rl.relabel import relabel
 from zest_rl.scorer import ScorerConfig
+
+SIDE = 16
+ROOM = {
+    "camera": spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8),
+    "grid": spaces.Box(-50, 50, (10, 10), np.float32),
+    "joints": spaces.Box(-1, 1, (3,), np.float32),
+}
+
+
+def write_minari(
+    dataset_id: str,
+    root: Path,
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    lengths: tuple[int, ...] = (4, 6),
+    infos: Callable[[int], dict[str, Any]] = lambda n_steps: {},
+) -> str:
+    """Leave a dataset of samples of its spaces, through Minari's own writer."""
+    observation_space.seed(0)
+    action_space.seed(0)
+    root.mkdir(exist_ok=True)
+    buffers = []
+    for i, length in enumerate(lengths):
+        observed = [observation_space.sample() for _ in range(length + 1)]
+        parts = (
+            {name: np.stack([one[name] for one in observed]) for name in observed[0]}
+            if isinstance(observed[0], dict)
+            else np.stack(observed)
+        )
+        last = np.arange(length) == length - 1
+        buffers.append(
+            EpisodeBuffer(
+                id=i, observations=parts, actions=np.stack([action_space.sample() for _ in range(length)]),
+                rewards=np.arange(length) / 8.0, terminations=last & False, truncations=last, infos=infos(length),
+            )
+        )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # datasets of tests have no author
+        minari.create_dataset_from_buffers(
+            dataset_id, buffers, observation_space=observation_space, action_space=action_space
+        )
+    return dataset_id
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A Minari root and a cache of this test's own."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "minari"
 
 
 @pytest.fixture
@@ -272,3 +326,16 @@ def test_the_verb_writes_beside_you_and_over_nothing(
     assert zest("export", collected, "--to", "torchrl")["file"] == "kitchen-micro-tiny-v0.torchrl"
     with pytest.raises(BadInput, match="unknown format 'rlds'"):
         export(collected, "rlds", tmp_path / "x")  # type: ignore[arg-type]
+
+
+def test_numbers_in_the_form_of_pictures_are_exported_and_what_is_left_out_is_told(
+    root: Path, tmp_path: Path, zest: Callable[..., dict[str, Any]]
+) -> None:
+    name = write_minari("room/some-v0", root, spaces.Dict(ROOM), spaces.Box(-1, 1, (2,), np.float32))
+    told = zest("export", name, "--output", tmp_path / "data.npz")
+    assert told["left_out"] == ["observations/camera"]
+    with h5py.File(root / name / "data/main_data.hdf5") as file, np.load(tmp_path / "data.npz") as found:
+        stored = [file[f"episode_{i}/observations"] for i in range(2)]
+        own = [np.concatenate([one["grid"][:-1].reshape(-1, 100), one["joints"][:-1]], axis=1) for one in stored]
+        np.testing.assert_array_equal(found["observations"], np.concatenate(own))
+        assert json.loads(str(found["about"]))["left_out"] == ["observations/camera"]

@@ -62,6 +62,8 @@ class Exported:
     arrays: tuple[str, ...]
     """Names of the arrays of `transitions`."""
     n_bytes: int
+    left_out: tuple[str, ...]
+    """Entries of the observations that are no numbers: pictures and text."""
 
 
 def export(dataset_id: str, to: Format, path: Path, rewards: Rewards = AS_RECORDED, fps: int | None = None) -> Exported:
@@ -106,4 +108,5 @@ def export(dataset_id: str, to: Format, path: Path, rewards: Rewards = AS_RECORD
             writer(temporary, contents)
     files = [file for file in (path, *path.rglob("*")) if file.is_file()]
     n_bytes = sum(file.stat().st_size for file in files)
-    return Exported(path, len(contents.episodes), len(contents), tuple(contents.episodes[0]), n_bytes)
+    arrays, left_out = tuple(contents.episodes[0]), tuple(contents.about["left_out"])
+    return Exported(path, len(contents.episodes), len(contents), arrays, n_bytes, left_out)

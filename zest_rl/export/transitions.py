@@ -10,11 +10,13 @@ import json
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl import data
 from zest_rl.errors import BadInput, nearest
+from zest_rl.observations import entries, is_numbers
 from zest_rl.types import FloatArray
 
 Shape = Literal["step", "difference", "terminal"]
@@ -96,6 +98,12 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
         truth = data.read_ground_truth(dataset_id)
         extras["gt_reward"] = [episode.rewards for episode in truth]
         extras["gt_episode_success"] = [np.full(len(episode.rewards), episode.success) for episode in truth]
+    widths = sorted({episode.obs.shape[1] for episode in episodes})
+    if len(widths) > 1:
+        raise BadInput(
+            f"the episodes of {dataset_id} must observe equally many numbers, got {widths}; where floats may be "
+            "pictures or numbers, declare bounds in the observation space: pictures are in [0, 1]"
+        )
     shaped = rewards.of([episode.rewards for episode in episodes], before)
     found = []
     for i, (episode, own) in enumerate(zip(episodes, shaped, strict=True)):
@@ -122,7 +130,7 @@ class Contents:
     scores: list[FloatArray] | None
     """(T+1,) each: ZeST scores of all frames, the first one too; None when the dataset was not relabeled."""
     about: dict[str, Any]
-    """JSON-ready: what a reader may want to know of where the file comes from."""
+    """JSON-ready: what a reader may want to know of where the file comes from, and what of it is left out."""
 
     def __len__(self) -> int:
         return sum(len(episode["rewards"]) for episode in self.episodes)
@@ -146,5 +154,14 @@ def read(dataset_id: str, rewards: Rewards = AS_RECORDED) -> Contents:
         "ref_min_score": metadata.get("ref_min_score"),
         "ref_max_score": metadata.get("ref_max_score"),
         "zest": metadata.get("zest"),
+        "left_out": _left_out(dataset_id),
     }
     return Contents(episodes, data.read_scores(dataset_id) if "zest_score" in episodes[0] else None, about)
+
+
+def _left_out(dataset_id: str) -> list[str]:
+    """Name the entries of the observations that are no numbers: pictures and text."""
+    name = data.episode_names(dataset_id)[0]
+    with h5py.File(data.dataset_path(dataset_id) / data.DATA_FILE, "r") as file:
+        found = entries(file[name]["observations"], "observations")
+        return [path for path, entry in found.items() if not is_numbers(entry)]
