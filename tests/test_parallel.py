@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,6 +71,20 @@ def beat(heart: Path) -> Arrays:
             file.write(".")
         time.sleep(0.05)
     return {"values": np.ones(1)}
+
+
+class Shared:
+    """Large, or so we say."""
+
+    n_sent = 0
+
+    def __reduce__(self) -> tuple[type[Shared], tuple[()]]:
+        Shared.n_sent += 1
+        return Shared, ()
+
+
+def draw_with(shared: Shared, seed: int) -> Arrays:
+    return draw(seed)
 
 
 def counted(calls: list[int]) -> Callable[[int], Arrays]:
@@ -187,6 +202,14 @@ def test_two_processes_leave_the_same_numbers_as_one(tmp_path: Path) -> None:
     assert numbers(tmp_path / "one").keys() == SEEDS.keys()
     assert processes(tmp_path / "one") == {os.getpid()}
     assert sorted(done) == sorted(SEEDS)
+
+
+def test_what_the_jobs_share_is_sent_to_the_workers_and_not_with_each_job(tmp_path: Path) -> None:
+    Shared.n_sent = 0
+    map_jobs(partial(draw_with, Shared()), SEEDS, tmp_path / "three", n_workers=3)
+    assert Shared.n_sent == 1
+    map_jobs(draw, SEEDS, tmp_path / "one", n_workers=1)
+    assert numbers(tmp_path / "three") == numbers(tmp_path / "one")
 
 
 def test_workers_use_one_thread_each_and_this_process_keeps_its_setting(
