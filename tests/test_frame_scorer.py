@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,19 +14,27 @@ from PIL import Image
 from zest_rl.frame_scorer import FrameScorer, FrameScorerConfig
 from zest_rl.sources import Source, open_source
 from zest_rl.sources.clips import Clips
+from zest_rl.types import Frame
 
 N_EPISODES = 4
 
 
 @dataclass(frozen=True)
 class CountedClips(Clips):
-    """Real pictures in folders, that tell how often they are sent somewhere."""
+    """Real pictures in folders, that tell how often they are sent to a process; here they wait for all but one."""
 
-    n_sent = [0]  # noqa: RUF012
+    cache: Path
+    n_sent: list[int]
 
     def __reduce__(self) -> tuple[Any, ...]:
         self.n_sent[0] += 1
         return Clips, (self.paths,)
+
+    def read(self, episode: int) -> Iterator[Sequence[Frame]]:
+        deadline = time.monotonic() + 60
+        while len(list(self.cache.glob("frames/*/*.npz"))) < N_EPISODES - 1 and time.monotonic() < deadline:
+            time.sleep(0.02)
+        return super().read(episode)
 
 
 @pytest.fixture
@@ -50,9 +60,9 @@ def picture(rng: np.random.Generator) -> np.ndarray:
 
 def test_the_paths_of_all_episodes_are_not_sent_with_each_job(source: Source, tmp_path: Path) -> None:
     assert isinstance(source.frames, Clips)
-    counted = Source(source.trajectories, CountedClips(source.frames.paths))
-    digests = [source.frames.digest(episode) for episode in range(N_EPISODES)]
-    scorer = FrameScorer(FrameScorerConfig(str(tmp_path / "goal")), device="cpu", n_workers=3)
-    scorer.embed(counted, digests)
-    assert CountedClips.n_sent == [1]
+    counted = CountedClips(source.frames.paths, tmp_path / "cache", [0])
+    digests = [counted.digest(episode) for episode in range(N_EPISODES)]
+    scorer = FrameScorer(FrameScorerConfig(str(tmp_path / "goal")), device="cpu", n_workers=2)
+    scorer.embed(Source(source.trajectories, counted), digests)
+    assert counted.n_sent == [1]
     assert [frames.shape for frames in scorer.embedded(source, digests)] == [(2, 1, 1280)] * N_EPISODES

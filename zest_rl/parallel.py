@@ -5,9 +5,7 @@ from __future__ import annotations
 import itertools
 import multiprocessing
 import os
-import pickle
 import sys
-import tempfile
 import threading
 import zipfile
 from collections import deque
@@ -129,9 +127,9 @@ _WORK: list[Callable[[Any], Arrays]] = []
 """Of this worker process."""
 
 
-def _start_worker(work: Path) -> None:
+def _start_worker(work: Callable[[Any], Arrays]) -> None:
     die_with_parent()
-    _WORK.append(pickle.loads(work.read_bytes()))
+    _WORK.append(work)
 
 
 def _run_job(job: Any, path: Path) -> None:
@@ -225,15 +223,9 @@ def _run_here(
         finished.put((name, future.exception()))
 
     context = multiprocessing.get_context("spawn")  # fork is unsafe beside torch's and the GL library's threads
-    with (
-        tempfile.NamedTemporaryFile(prefix="zest-work-") as sent,  # through a pipe it would hold up their starts
-        ProcessPoolExecutor(
-            max(n_workers - 1, 1), mp_context=context, initializer=_start_worker, initargs=(Path(sent.name),)
-        ) as pool,
-    ):
-        if n_workers > 1:
-            sent.write(pickle.dumps(work))
-            sent.flush()
+    with ProcessPoolExecutor(
+        max(n_workers - 1, 1), mp_context=context, initializer=_start_worker, initargs=(work,)
+    ) as pool:
         with starting_children():  # submitting starts them
             for _ in range(n_workers - 1):
                 submit()
