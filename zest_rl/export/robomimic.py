@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 
 from zest_rl.errors import BadInput
-from zest_rl.export.transitions import Contents
+from zest_rl.export.transitions import Contents, check_continuous
 
 VALID_SHARE = 0.1
 """Of the episodes, for the mask ``valid``."""
@@ -19,8 +19,9 @@ def write(path: Path, contents: Contents) -> None:
     """Write ``data/demo_I`` with ``obs/flat`` and ``next_obs/flat``; ``dones`` are terminals and timeouts alike.
 
     Raises:
-        BadInput: one episode alone, which cannot be parted.
+        BadInput: one episode alone, which cannot be parted, or actions are whole numbers.
     """
+    check_continuous(contents, "robomimic")
     episodes = contents.episodes
     if len(episodes) < 2:
         raise BadInput("robomimic's masks part the episodes into train and valid, which takes 2 or more; got 1")

@@ -76,12 +76,14 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
         observations, next_observations (T, obs_dim), actions (T, act_dim), rewards (T,) float32; terminals, timeouts
         (T,) bool; and where they are recorded, zest_score, gt_reward (T,) float32 after the action,
         gt_episode_success (T,) bool, of the whole episode, and source_reward (T,) float32, which another robot's
-        dataset came with. A Dict of observations is flattened (`zest_rl.observations.numbers`).
+        dataset came with. A Dict of observations is flattened (`zest_rl.observations.numbers`), and so are actions of
+        several dimensions; whole numbers among the actions are int64, (T,) those of a Discrete space.
 
     Raises:
         BadInput: no such dataset, the rewards cannot be normalised, or are differences already.
     """
-    episodes = data.read_episodes(dataset_id)
+    episodes = data.read_episodes(dataset_id, discrete=True)
+    actions = _actions(dataset_id, [episode.actions for episode in episodes])
     made = data.read_metadata(dataset_id).get("zest", {}).get("relabel")
     before = [0.0] * len(episodes)
     extras: dict[str, list[NDArray[Any]]] = {}
@@ -111,7 +113,7 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
         found.append(
             {
                 "observations": episode.obs[:-1],
-                "actions": episode.actions,
+                "actions": actions[i],
                 "rewards": own,
                 "next_observations": episode.obs[1:],
                 "terminals": last & episode.terminated,
@@ -133,7 +135,7 @@ class Contents:
     """JSON-ready: what a reader may want to know of where the file comes from, and what of it is left out."""
 
     def __len__(self) -> int:
-        return sum(len(episode["rewards"]) for episode in self.episodes)
+        return sum(len(next(iter(episode.values()))) for episode in self.episodes)
 
     @property
     def flat(self) -> Transitions:
@@ -157,6 +159,34 @@ def read(dataset_id: str, rewards: Rewards = AS_RECORDED) -> Contents:
         "left_out": _left_out(dataset_id),
     }
     return Contents(episodes, data.read_scores(dataset_id) if "zest_score" in episodes[0] else None, about)
+
+
+def read_scores(dataset_id: str) -> Contents:
+    """Read the scores alone, of a dataset that may hold pictures alone.
+
+    Raises:
+        BadInput: no such dataset, or it was not relabeled.
+    """
+    if "relabel" not in data.read_metadata(dataset_id).get("zest", {}):
+        raise BadInput("progress is read from ZeST scores, which this dataset has not; relabel it with `zest relabel`")
+    scores = data.read_scores(dataset_id)
+    return Contents([{"zest_score": score[1:]} for score in scores], scores, {"left_out": []})
+
+
+def _actions(dataset_id: str, episodes: list[FloatArray]) -> list[NDArray[Any]]:
+    """Give actions (T, act_dim) back the type and, where they are of a Discrete space, the shape that they have."""
+    name = data.episode_names(dataset_id)[0]
+    with h5py.File(data.dataset_path(dataset_id) / data.DATA_FILE, "r") as file:
+        stored = file[name]["actions"]
+        if stored.dtype.kind == "f":
+            return list(episodes)
+        return [one[:, 0].astype(np.int64) if stored.ndim == 1 else one.astype(np.int64) for one in episodes]
+
+
+def check_continuous(contents: Contents, reader: str) -> None:
+    """Raise `BadInput` where the actions are whole numbers, which `reader` has no policies for."""
+    if contents.episodes[0]["actions"].dtype.kind == "i":
+        raise BadInput(f"{reader} takes continuous actions, got whole numbers; export to npz, d4rl, d3rlpy or torchrl")
 
 
 def _left_out(dataset_id: str) -> list[str]:
