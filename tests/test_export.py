@@ -413,3 +413,10 @@ def test_actions_of_several_dimensions_are_flattened(root: Path, tmp_path: Path,
     with h5py.File(root / name / "data/main_data.hdf5") as file:
         for i, episode in enumerate(transitions(name)):
             np.testing.assert_array_equal(episode["actions"], file[f"episode_{i}/actions"][()].reshape(-1, 6))
+
+
+def test_a_single_episode_is_one_to_train_robomimic_on(root: Path, tmp_path: Path) -> None:
+    name = write_minari("room/one-v0", root, spaces.Dict(ROOM), spaces.Box(-1, 1, (2,), np.float32), (4,))
+    with h5py.File(export(name, "robomimic", tmp_path / "data.hdf5").path) as file:
+        masks = {mask: members[()].tolist() for mask, members in file["mask"].items()}
+    assert masks == {"train": [b"demo_0"], "valid": []}
