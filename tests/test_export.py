@@ -22,6 +22,7 @@ from pyarrow import parquet
 from zest_rl import cli, data
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.export import Rewards, export, transitions
+from zest_rl.export.lerobot import DATA_FILE
 from zest_rl.frames import Views
 from zest_rl.relabel import relabel
 from zest_rl.scorer import ScorerConfig
@@ -413,6 +414,35 @@ def test_actions_of_several_dimensions_are_flattened(root: Path, tmp_path: Path,
     with h5py.File(root / name / "data/main_data.hdf5") as file:
         for i, episode in enumerate(transitions(name)):
             np.testing.assert_array_equal(episode["actions"], file[f"episode_{i}/actions"][()].reshape(-1, 6))
+
+
+@pytest.mark.parametrize("info", ["success", "is_success"])
+def test_success_of_the_source_stands_beside_the_scores(
+    root: Path, goal: Path, tmp_path: Path, zest: Callable[..., dict[str, Any]], info: str
+) -> None:
+    def infos(n_steps: int) -> dict[str, Any]:
+        return {info: np.arange(n_steps + 1) == n_steps - 1}
+
+    name = write_minari("room/done-v0", root, spaces.Dict(ROOM), spaces.Box(-1, 1, (2,), np.float32), infos=infos)
+    scored = zest("relabel", name, "--goal", goal, "--n-workers", "1")["dataset"]
+    with np.load(export(scored, "npz", tmp_path / "data.npz").path) as found:
+        assert np.flatnonzero(found["success"]).tolist() == [2, 8]
+        assert found["success"].dtype == bool
+        assert {"zest_score", "source_reward"} <= set(found)
+    folder = export(scored, "lerobot", tmp_path / "lerobot").path
+    assert np.flatnonzero(parquet.read_table(folder / DATA_FILE).to_pydict()["next.success"]).tolist() == [2, 8]
+    assert np.fromfile(export(scored, "torchrl", tmp_path / "t").path / "next/success.memmap", bool).sum() == 2
+    again = zest("relabel", folder, "--goal", goal, "--frames", clips(tmp_path), "--n-workers", "1")["dataset"]
+    assert np.flatnonzero(np.concatenate([one["success"] for one in transitions(again)])).tolist() == [2, 8]
+
+
+def clips(folder: Path) -> Path:
+    """Leave a picture of each step of two episodes."""
+    for i, n_steps in enumerate((4, 6)):
+        (folder / f"films/episode_{i}").mkdir(parents=True)
+        for t in range(n_steps):
+            Image.new("RGB", (SIDE, SIDE), (20 * t, 9, 9)).save(folder / f"films/episode_{i}/{t}.png")
+    return folder / "films"
 
 
 def test_a_single_episode_is_one_to_train_robomimic_on(root: Path, tmp_path: Path) -> None:

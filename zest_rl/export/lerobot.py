@@ -135,6 +135,7 @@ def _columns(flat: Transitions, starts: NDArray[Any], fps: int) -> Columns:
         "next.zest_score": "zest_score",
         "next.gt_reward": "gt_reward",
         "next.source_reward": "source_reward",
+        "next.success": "success",
         "gt_episode_success": "gt_episode_success",
     }
     return columns | {name: flat[key] for name, key in extras.items() if key in flat}

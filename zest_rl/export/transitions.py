@@ -60,6 +60,8 @@ class Rewards:
         ]
 
 
+SUCCESS = ("infos/source/success", "infos/success", "infos/is_success")
+"""Where datasets of other robots hold success by step: LeRobot's once relabeled; Adroit's and mazes'; Fetch's."""
 Transitions = dict[str, NDArray[Any]]
 """Equally long arrays of one episode, see `transitions`."""
 AS_RECORDED = Rewards()
@@ -75,9 +77,10 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
     Returns:
         observations, next_observations (T, obs_dim), actions (T, act_dim), rewards (T,) float32; terminals, timeouts
         (T,) bool; and where they are recorded, zest_score, gt_reward (T,) float32 after the action,
-        gt_episode_success (T,) bool, of the whole episode, and source_reward (T,) float32, which another robot's
-        dataset came with. A Dict of observations is flattened (`zest_rl.observations.numbers`), and so are actions of
-        several dimensions; whole numbers among the actions are int64, (T,) those of a Discrete space.
+        gt_episode_success (T,) bool, of the whole episode, and source_reward (T,) float32 and success (T,) bool after
+        the action, which another robot's dataset came with. A Dict of observations is flattened
+        (`zest_rl.observations.numbers`), and so are actions of several dimensions; whole numbers among the actions are
+        int64, (T,) those of a Discrete space.
 
     Raises:
         BadInput: no such dataset, the rewards cannot be normalised, or are differences already.
@@ -106,6 +109,9 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
             f"the episodes of {dataset_id} must observe equally many numbers, got {widths}; where floats may be "
             "pictures or numbers, declare bounds in the observation space: pictures are in [0, 1]"
         )
+    success = _success(dataset_id)
+    if success is not None:
+        extras["success"] = success
     shaped = rewards.of([episode.rewards for episode in episodes], before)
     found = []
     for i, (episode, own) in enumerate(zip(episodes, shaped, strict=True)):
@@ -181,6 +187,20 @@ def _actions(dataset_id: str, episodes: list[FloatArray]) -> list[NDArray[Any]]:
         if stored.dtype.kind == "f":
             return list(episodes)
         return [one[:, 0].astype(np.int64) if stored.ndim == 1 else one.astype(np.int64) for one in episodes]
+
+
+def _success(dataset_id: str) -> list[NDArray[np.bool_]] | None:
+    """Read whether the task was done after each action: (T,) per episode; None where an episode does not hold it."""
+    found = []
+    names = data.episode_names(dataset_id)
+    with h5py.File(data.dataset_path(dataset_id) / data.DATA_FILE, "r") as file:
+        for episode in (file[name] for name in names):
+            path = next((path for path in SUCCESS if path in episode), None)
+            n_steps = len(episode["actions"])
+            if path is None or len(episode[path]) not in (n_steps, n_steps + 1):
+                return None
+            found.append(np.asarray(episode[path][-n_steps:], dtype=bool).reshape(n_steps, -1)[:, 0])
+    return found
 
 
 def check_continuous(contents: Contents, reader: str) -> None:
