@@ -5,21 +5,87 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import h5py
+import minari
 import numpy as np
 import pytest
+from gymnasium import spaces
+from minari.data_collector import EpisodeBuffer
+from PIL import Image
 from pyarrow import parquet
 
 from zest_rl import cli, data
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.export import Rewards, export, transitions
+from zest_rl.export.lerobot import DATA_FILE
 from zest_rl.frames import Views
 from zest_rl.relabel import relabel
 from zest_rl.scorer import ScorerConfig
+
+SIDE = 16
+ROOM = {
+    "camera": spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8),
+    "grid": spaces.Box(-50, 50, (10, 10), np.float32),
+    "joints": spaces.Box(-1, 1, (3,), np.float32),
+}
+
+
+def write_minari(
+    dataset_id: str,
+    root: Path,
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    lengths: tuple[int, ...] = (4, 6),
+    infos: Callable[[int], dict[str, Any]] = lambda n_steps: {},
+) -> str:
+    """Leave a dataset of samples of its spaces, through Minari's own writer."""
+    observation_space.seed(0)
+    action_space.seed(0)
+    root.mkdir(exist_ok=True)
+    buffers = []
+    for i, length in enumerate(lengths):
+        observed = [observation_space.sample() for _ in range(length + 1)]
+        parts = (
+            {name: np.stack([one[name] for one in observed]) for name in observed[0]}
+            if isinstance(observed[0], dict)
+            else np.stack(observed)
+        )
+        last = np.arange(length) == length - 1
+        buffers.append(
+            EpisodeBuffer(
+                id=i, observations=parts, actions=np.stack([action_space.sample() for _ in range(length)]),
+                rewards=np.arange(length) / 8.0, terminations=last & False, truncations=last, infos=infos(length),
+            )
+        )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # datasets of tests have no author
+        minari.create_dataset_from_buffers(
+            dataset_id, buffers, observation_space=observation_space, action_space=action_space
+        )
+    return dataset_id
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A Minari root and a cache of this test's own."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "minari"
+
+
+@pytest.fixture
+def goal(tmp_path: Path) -> Path:
+    """A start and a goal as pictures of noise."""
+    for i, part in enumerate(("init", "goal")):
+        (tmp_path / "goal" / part).mkdir(parents=True)
+        noise = np.random.default_rng(i).integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(tmp_path / "goal" / part / "0.png")
+    return tmp_path / "goal"
 
 
 @pytest.fixture
@@ -272,3 +338,115 @@ def test_the_verb_writes_beside_you_and_over_nothing(
     assert zest("export", collected, "--to", "torchrl")["file"] == "kitchen-micro-tiny-v0.torchrl"
     with pytest.raises(BadInput, match="unknown format 'rlds'"):
         export(collected, "rlds", tmp_path / "x")  # type: ignore[arg-type]
+
+
+def test_numbers_in_the_form_of_pictures_are_exported_and_what_is_left_out_is_told(
+    root: Path, tmp_path: Path, zest: Callable[..., dict[str, Any]]
+) -> None:
+    name = write_minari("room/some-v0", root, spaces.Dict(ROOM), spaces.Box(-1, 1, (2,), np.float32))
+    told = zest("export", name, "--output", tmp_path / "data.npz")
+    assert told["left_out"] == ["observations/camera"]
+    with h5py.File(root / name / "data/main_data.hdf5") as file, np.load(tmp_path / "data.npz") as found:
+        stored = [file[f"episode_{i}/observations"] for i in range(2)]
+        own = [np.concatenate([one["grid"][:-1].reshape(-1, 100), one["joints"][:-1]], axis=1) for one in stored]
+        np.testing.assert_array_equal(found["observations"], np.concatenate(own))
+        assert json.loads(str(found["about"]))["left_out"] == ["observations/camera"]
+
+
+def test_progress_of_pictures_alone_is_exported_and_told_of_by_inspect(
+    root: Path, goal: Path, tmp_path: Path, zest: Callable[..., dict[str, Any]]
+) -> None:
+    name = write_minari("room/seen-v0", root, ROOM["camera"], spaces.Box(-1, 1, (2,), np.float32), (2, 3, 2))
+    scored = zest("relabel", name, "--goal", goal, "--n-workers", "1")
+    told = zest("export", scored["dataset"], "--to", "lerobot-progress", "--output", tmp_path / "progress.parquet")
+    assert (told["n_episodes"], told["n_transitions"], told["arrays"]) == (3, 7, ["zest_score"])
+    rows = parquet.read_table(told["file"]).to_pydict()
+    scores = [score[:-1] for score in data.read_scores(scored["dataset"])]
+    np.testing.assert_array_equal(rows["zest_score"], np.concatenate(scores))
+    assert scored["next"] == f"zest inspect {scored['dataset']}"
+    assert scored["dataset"] in zest(*scored["next"].split()[1:], "--output", tmp_path / "page.html")["datasets"]
+    with pytest.raises(BadInput, match="holds pictures only; a policy here needs numbers"):
+        export(scored["dataset"], "npz", tmp_path / "x")
+
+
+def test_discrete_actions_stay_whole_numbers_for_those_that_take_them(
+    root: Path, goal: Path, tmp_path: Path, zest: Callable[..., dict[str, Any]]
+) -> None:
+    name = write_minari("room/buttons-v0", root, spaces.Dict(ROOM), spaces.Discrete(4))
+    told = zest("relabel", name, "--goal", goal, "--n-workers", "1")
+    scored = told["dataset"]
+    assert told["next"] == f"zest export {scored} --to npz"
+    with h5py.File(root / name / "data/main_data.hdf5") as file:
+        own = [file[f"episode_{i}/actions"][()] for i in range(2)]
+    for to in ("npz", "d4rl"):
+        path = export(scored, to, tmp_path / to).path  # type: ignore[arg-type]
+        with np.load(path) if to == "npz" else h5py.File(path) as found:
+            np.testing.assert_array_equal(found["actions"][()], np.concatenate(own))
+            assert found["actions"].dtype == np.int64
+    with h5py.File(export(scored, "d3rlpy", tmp_path / "d3rlpy").path) as found:
+        for i, actions in enumerate(own):
+            np.testing.assert_array_equal(found[f"actions_{i}"], actions[:, None])
+    folder = export(scored, "torchrl", tmp_path / "torchrl").path
+    assert json.loads((folder / "meta.json").read_text())["action"]["shape"] == [10]
+    np.testing.assert_array_equal(np.fromfile(folder / "action.memmap", np.int64), np.concatenate(own))
+    for to in ("robomimic", "lerobot"):
+        with pytest.raises(BadInput, match="takes continuous actions, got whole numbers; export to npz"):
+            export(scored, to, tmp_path / to)  # type: ignore[arg-type]
+        assert not (tmp_path / to).exists()
+    assert export(scored, "lerobot-progress", tmp_path / "progress").n_transitions == 10
+    with pytest.raises(BadInput, match="its actions are discrete, a policy here acts by continuous ones"):
+        data.read_episodes(scored)
+
+
+def test_several_whole_numbers_per_action_are_not_taken_for_one(root: Path, tmp_path: Path) -> None:
+    name = write_minari("room/switches-v0", root, spaces.Dict(ROOM), spaces.MultiDiscrete([2, 3]))
+    with np.load(export(name, "npz", tmp_path / "data.npz").path) as found:
+        assert (found["actions"].shape, found["actions"].dtype) == ((10, 2), np.int64)
+    with pytest.raises(BadInput, match="d3rlpy takes one whole number per action, got 2"):
+        export(name, "d3rlpy", tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("to", ["npz", "d4rl", "robomimic", "d3rlpy", "torchrl", "lerobot"])
+def test_actions_of_several_dimensions_are_flattened(root: Path, tmp_path: Path, to: str) -> None:
+    name = write_minari("room/arms-v0", root, spaces.Dict(ROOM), spaces.Box(-1, 1, (2, 3), np.float32))
+    assert export(name, to, tmp_path / "data").n_transitions == 10  # type: ignore[arg-type]
+    with h5py.File(root / name / "data/main_data.hdf5") as file:
+        for i, episode in enumerate(transitions(name)):
+            np.testing.assert_array_equal(episode["actions"], file[f"episode_{i}/actions"][()].reshape(-1, 6))
+
+
+@pytest.mark.parametrize("info", ["success", "is_success"])
+def test_success_of_the_source_stands_beside_the_scores(
+    root: Path, goal: Path, tmp_path: Path, zest: Callable[..., dict[str, Any]], info: str
+) -> None:
+    def infos(n_steps: int) -> dict[str, Any]:
+        return {info: np.arange(n_steps + 1) == n_steps - 1}
+
+    name = write_minari("room/done-v0", root, spaces.Dict(ROOM), spaces.Box(-1, 1, (2,), np.float32), infos=infos)
+    scored = zest("relabel", name, "--goal", goal, "--n-workers", "1")["dataset"]
+    with np.load(export(scored, "npz", tmp_path / "data.npz").path) as found:
+        assert np.flatnonzero(found["success"]).tolist() == [2, 8]
+        assert found["success"].dtype == bool
+        assert {"zest_score", "source_reward"} <= set(found)
+    folder = export(scored, "lerobot", tmp_path / "lerobot").path
+    assert np.flatnonzero(parquet.read_table(folder / DATA_FILE).to_pydict()["next.success"]).tolist() == [2, 8]
+    assert np.fromfile(export(scored, "torchrl", tmp_path / "t").path / "next/success.memmap", bool).sum() == 2
+    again = zest("relabel", folder, "--goal", goal, "--frames", clips(tmp_path), "--n-workers", "1")["dataset"]
+    assert np.flatnonzero(np.concatenate([one["success"] for one in transitions(again)])).tolist() == [2, 8]
+
+
+def clips(folder: Path) -> Path:
+    """Leave a picture of each step of two episodes."""
+    for i, n_steps in enumerate((4, 6)):
+        (folder / f"films/episode_{i}").mkdir(parents=True)
+        for t in range(n_steps):
+            Image.new("RGB", (SIDE, SIDE), (20 * t, 9, 9)).save(folder / f"films/episode_{i}/{t}.png")
+    return folder / "films"
+
+
+def test_a_single_episode_is_one_to_train_robomimic_on(root: Path, tmp_path: Path) -> None:
+    name = write_minari("room/one-v0", root, spaces.Dict(ROOM), spaces.Box(-1, 1, (2,), np.float32), (4,))
+    with h5py.File(export(name, "robomimic", tmp_path / "data.hdf5").path) as file:
+        masks = {mask: members[()].tolist() for mask, members in file["mask"].items()}
+    assert masks == {"train": [b"demo_0"], "valid": []}

@@ -11,6 +11,8 @@ import pytest
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
+from minari.data_collector import EpisodeBuffer
+from minari.dataset.minari_storage import MinariStorage
 from PIL import Image
 
 from zest_rl.errors import BadInput
@@ -87,6 +89,37 @@ def test_what_is_no_picture_is_not_taken_for_one(group: h5py.Group, array: np.nd
     assert n_channels(entry) is None, why
     with pytest.raises(BadInput, match="/observations/entry holds no pictures"):
         read_pictures(entry, slice(None))
+
+
+def test_floats_of_another_range_than_pictures_are_numbers_unless_they_are_asked_for(group: h5py.Group) -> None:
+    rng = np.random.default_rng(0)
+    group["camera"], group["grid"] = rng.random((3, 16, 20, 3)), rng.uniform(-50, 50, (3, 10, 10))
+    group["joints"] = rng.random((3, 4))
+    found = {name: n_channels(entry) for name, entry in entries(group).items()}
+    assert found == {"camera": 3, "grid": 0, "joints": None}
+    grid = group["grid"][()].astype(np.float32).reshape(3, 100)
+    np.testing.assert_array_equal(numbers(group), np.concatenate([grid, group["joints"][()].astype("f4")], axis=1))
+    assert choose_pictures(found, (), "it") == ["camera"]
+    assert choose_pictures(found, ("grid",), "it") == ["grid"]
+    with pytest.raises(BadInput, match=r"observations/grid: pictures of floats must be in \[0, 1\], got -"):
+        read_pictures(group["grid"], slice(None))
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "channels"), [(0, 1, 1), (-50, 50, 0), (0, np.inf, 0), (0, 255, 0), (-np.inf, np.inf, 1)]
+)
+def test_the_declared_bounds_tell_pictures_from_numbers_whatever_an_episode_holds(
+    tmp_path: Path, low: float, high: float, channels: int
+) -> None:
+    space = spaces.Dict({"parts": spaces.Tuple((spaces.Discrete(2), spaces.Box(low, high, (10, 10), np.float32)))})
+    storage = MinariStorage.new(tmp_path, observation_space=space, action_space=spaces.Discrete(2))
+    dark = {"parts": (np.zeros(2, int), np.zeros((2, 10, 10), np.float32))}
+    one = np.zeros(1)
+    storage.update_episodes([EpisodeBuffer(0, None, None, dark, one.astype(int), one, one == 1, one == 0, {})])
+    with h5py.File(tmp_path / "main_data.hdf5") as file:
+        observations = file["episode_0/observations"]
+        assert n_channels(observations["parts/_index_1"]) == channels
+        assert numbers(observations).shape == (2, 1 if channels else 101)
 
 
 @pytest.mark.parametrize("value", [-0.1, 1.5, 255.0, np.nan])

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,6 +71,24 @@ def beat(heart: Path) -> Arrays:
             file.write(".")
         time.sleep(0.05)
     return {"values": np.ones(1)}
+
+
+class Shared:
+    """Large, or so we say."""
+
+    n_sent = 0
+
+    def __reduce__(self) -> tuple[type[Shared], tuple[()]]:
+        Shared.n_sent += 1
+        return Shared, ()
+
+
+def draw_once_all_others_are_drawn(shared: Shared, parent: int, folder: Path, seed: int) -> Arrays:
+    """In the process `parent` wait until but one part is there; draw at once in any other."""
+    deadline = time.monotonic() + 60
+    while os.getpid() == parent and len(list(folder.glob("*.npz"))) < len(SEEDS) - 1 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return draw(seed)
 
 
 def counted(calls: list[int]) -> Callable[[int], Arrays]:
@@ -187,6 +206,15 @@ def test_two_processes_leave_the_same_numbers_as_one(tmp_path: Path) -> None:
     assert numbers(tmp_path / "one").keys() == SEEDS.keys()
     assert processes(tmp_path / "one") == {os.getpid()}
     assert sorted(done) == sorted(SEEDS)
+
+
+def test_what_the_jobs_share_is_sent_to_a_worker_once_and_not_with_each_job(tmp_path: Path) -> None:
+    Shared.n_sent = 0
+    work = partial(draw_once_all_others_are_drawn, Shared(), os.getpid(), tmp_path / "two")
+    map_jobs(work, SEEDS, tmp_path / "two", n_workers=2)
+    assert Shared.n_sent == 1
+    map_jobs(draw, SEEDS, tmp_path / "one", n_workers=1)
+    assert numbers(tmp_path / "two") == numbers(tmp_path / "one")
 
 
 def test_workers_use_one_thread_each_and_this_process_keeps_its_setting(

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -179,6 +180,15 @@ def _observations(group: h5py.Group, dataset_id: str) -> FloatArray:
     return _array(group, "observations", np.float32, dataset_id)
 
 
+def _actions(group: h5py.Group, dataset_id: str, discrete: bool) -> FloatArray:
+    actions = _array(group, "actions", np.float32, dataset_id)
+    if actions.ndim > 1 or discrete:
+        return actions.reshape(len(actions), math.prod(actions.shape[1:]))
+    if group["actions"].dtype.kind != "f":
+        raise BadInput("its actions are discrete, a policy here acts by continuous ones; `zest export` takes them")
+    return actions
+
+
 def episode_names(dataset_id: str) -> list[str]:
     """Return the names of the episodes' groups in the HDF5 file, in order.
 
@@ -189,11 +199,14 @@ def episode_names(dataset_id: str) -> list[str]:
         return names
 
 
-def read_episodes(dataset_id: str) -> list[Episode]:
+def read_episodes(dataset_id: str, *, discrete: bool = False) -> list[Episode]:
     """Read what a trainer may see of every episode; a Dict of observations is flattened (`observations.numbers`).
 
+    Actions of several dimensions are flattened; those of a Discrete space (T,) are read as (T, 1) where `discrete`.
+
     Raises:
-        BadInput: no such dataset, an episode without steps, lengths that do not fit, NaN, no observations but pictures.
+        BadInput: no such dataset, an episode without steps, lengths that do not fit, NaN, no observations but pictures,
+            discrete actions that were not asked for.
         ZestError: the files were damaged.
     """
 
@@ -201,7 +214,7 @@ def read_episodes(dataset_id: str) -> list[Episode]:
         ends = _array(group, "terminations", bool, dataset_id)
         return Episode(
             obs=_observations(group, dataset_id),
-            actions=_array(group, "actions", np.float32, dataset_id),
+            actions=_actions(group, dataset_id, discrete),
             rewards=_array(group, "rewards", np.float32, dataset_id),
             terminated=bool(len(ends) and ends[-1]),
         )

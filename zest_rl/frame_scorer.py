@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -49,12 +50,10 @@ class FrameScorerConfig:
 
 
 @dataclass(frozen=True)
-class _Job:
-    """One episode to embed."""
+class _Shared:
+    """What the jobs have in common: with the paths of all episodes, it is sent to a worker once and not with each."""
 
     frames: Frames
-    episode: int
-    n_steps: int
     embedder: str
     precision: Precision
     device: str
@@ -62,10 +61,18 @@ class _Job:
     """Of the embedder."""
 
 
-def _embed_episode(job: _Job) -> dict[str, NDArray[np.generic]]:
-    embedder = shared_embedder(job.embedder, job.precision, job.device)
-    check_same_embedder(embedder, job.fingerprint)
-    steps = islice(job.frames.read(job.episode), job.n_steps + 2)  # one more than there may be shows that it is wrong
+@dataclass(frozen=True)
+class _Job:
+    """One episode to embed."""
+
+    episode: int
+    n_steps: int
+
+
+def _embed_episode(shared: _Shared, job: _Job) -> dict[str, NDArray[np.generic]]:
+    embedder = shared_embedder(shared.embedder, shared.precision, shared.device)
+    check_same_embedder(embedder, shared.fingerprint)
+    steps = islice(shared.frames.read(job.episode), job.n_steps + 2)  # one more than may be shows that it is wrong
     parts = []
     with one_thread():
         while batch := list(islice(steps, STEPS_PER_BATCH)):
@@ -125,14 +132,14 @@ class FrameScorer:
             ZestError: a worker process died; finished episodes are kept.
         """
         config, n_steps = self.config, source.trajectories.n_steps
-        how = (config.embedder, config.precision, self.device, self.embedder.fingerprint)
+        shared = _Shared(source.frames, config.embedder, config.precision, self.device, self.embedder.fingerprint)
         jobs = {
-            self._name(digest): _Job(source.frames, i, n_steps[i], *how)
+            self._name(digest): _Job(i, n_steps[i])
             for i, digest in enumerate(digests)
             if not self._path(digest).exists()
         }
         map_jobs(
-            _embed_episode,
+            partial(_embed_episode, shared),
             jobs,
             self._folder,
             n_workers=self.n_workers,

@@ -194,7 +194,7 @@ def inspect(dataset_id: str) -> Inspection:
         raise BadInput(f"dataset {dataset_id} holds no ZeST scores; run `zest relabel {dataset_id}` and inspect that")
     config = made["scorer"]["config"]
     views = None if data.is_foreign(metadata) else Views(**config["views"])
-    step_rewards = [episode.rewards for episode in data.read_episodes(dataset_id)]
+    step_rewards = data.read_rewards(dataset_id)
     if len(step_rewards) < MIN_EPISODES_TO_RANK:
         raise BadInput(
             f"rewards can be judged on at least {MIN_EPISODES_TO_RANK} episodes, {dataset_id} has {len(step_rewards)}"

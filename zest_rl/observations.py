@@ -2,13 +2,17 @@
 
 A Dict or Tuple space is a group, each entry a dataset with one row per step; entries go by their paths within the
 group. A *picture* is (H, W) or (H, W, C) or (C, H, W) with 1 or 3 channels and sides of at least `MIN_SIDE` pixels, as
-uint8 or as floats in [0, 1]; or one JPEG file per step, which Minari makes of uint8 pictures by default (lossy).
+uint8 or as floats in [0, 1]; or one JPEG file per step, which Minari makes of uint8 pictures by default (lossy). Floats
+of that form with another range are numbers; the range is the space's where it is finite, else that of the values.
 """
 
 from __future__ import annotations
 
+import functools
 import io
+import json
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -36,15 +40,49 @@ def entries(node: h5py.Group | h5py.Dataset, prefix: str = "") -> dict[str, h5py
 
 
 def n_channels(entry: h5py.Dataset) -> int | None:
-    """Return 1 or 3 for pictures (3 for JPEG files), None for anything else."""
+    """Return 1 or 3 for pictures (3 for JPEG files), 0 for floats of that form but not in [0, 1], None for the rest."""
+    channels = _form(entry)
+    return channels if channels is None or entry.dtype.kind != "f" or _are_shares(entry) else 0
+
+
+def is_numbers(entry: h5py.Dataset) -> bool:
+    """Whether an entry holds numbers for a policy: no pictures, no text, a row per step."""
+    return not n_channels(entry) and entry.dtype.kind in "biuf" and entry.ndim > 0
+
+
+def _form(entry: h5py.Dataset) -> int | None:
     if _is_jpeg(entry):
         return 3
     return None if entry.dtype.kind not in "uf" else _channels(entry.shape[1:])
 
 
-def is_numbers(entry: h5py.Dataset) -> bool:
-    """Whether an entry holds numbers for a policy: no pictures, no text, a row per step."""
-    return n_channels(entry) is None and entry.dtype.kind in "biuf" and entry.ndim > 0
+def _are_shares(entry: h5py.Dataset) -> bool:
+    """Whether floats are in [0, 1], by their space, or by their values where that has no bounds."""
+    bounds = _declared_bounds(entry)
+    if np.isfinite(bounds).all():
+        return bounds[0] >= 0 and bounds[1] <= 1
+    if np.isfinite(bounds).any():
+        return False
+    return all(bool(rows.min() >= 0 and rows.max() <= 1) for rows in stored_rows(entry))  # NaN is not
+
+
+def _declared_bounds(entry: h5py.Dataset) -> tuple[float, float]:
+    """Return the lowest and the highest value of an entry's space, which Minari keeps beside its file."""
+    metadata = Path(entry.file.filename).with_name("metadata.json")
+    _, _, path = entry.name.partition("/observations")
+    try:
+        space = _observation_space(metadata, metadata.stat().st_mtime_ns)
+        for name in path.split("/")[1:]:
+            parts = space["subspaces"]
+            space = parts[int(name.removeprefix("_index_"))] if isinstance(parts, list) else parts[name]
+        return float(np.min(space["low"])), float(np.max(space["high"]))
+    except (OSError, KeyError, IndexError, TypeError, ValueError):
+        return -np.inf, np.inf
+
+
+@functools.lru_cache(maxsize=4)
+def _observation_space(metadata: Path, changed: int) -> Any:
+    return json.loads(json.loads(metadata.read_text())["observation_space"])  # large: it has bounds for each pixel
 
 
 def _is_jpeg(entry: h5py.Dataset) -> bool:
@@ -71,7 +109,7 @@ def read_pictures(entry: h5py.Dataset, rows: slice) -> list[Frame]:
     Raises:
         BadInput: the entry holds no pictures, or floats that are not in [0, 1].
     """
-    if n_channels(entry) is None:
+    if _form(entry) is None:
         raise BadInput(
             f"{entry.name} holds no pictures (got shape {entry.shape[1:]} and dtype {entry.dtype} per step); they must "
             "be (H, W), (H, W, C) or (C, H, W) with 1 or 3 channels, uint8 or floats in [0, 1]"
@@ -106,7 +144,7 @@ def choose_pictures(found: dict[str, int | None], wanted: Iterable[str], where: 
     """Choose the entries whose pictures are the frames: those that are asked for, or the only one.
 
     Args:
-        found: entry → its number of channels, None where it is no picture.
+        found: entry → its number of channels, None where it is no picture, 0 where it is one only if it is asked for.
         wanted: their names, with or without `prefix`; empty: the only one in colour, else the only one.
         where: names the dataset in an error.
         prefix: what stands before each name for the user, such as ``observations``.
@@ -127,9 +165,10 @@ def choose_pictures(found: dict[str, int | None], wanted: Iterable[str], where: 
     if chosen:
         return chosen
     colour = [name for name in shown if found[name] == 3]
-    candidates = colour or list(shown)
+    candidates = colour or [name for name in shown if found[name]]
     if len(candidates) != 1:
-        problem = "no entry with pictures" if not candidates else f"several entries with pictures: {listing}"
+        several = ", ".join(shown[name] for name in candidates)
+        problem = f"several entries with pictures: {several}" if candidates else "no entry with pictures"
         raise BadInput(
             f"{where} has {problem}; "
             + ("choose with --frames KEY, or several keys to average them as views" if candidates else "see --help")

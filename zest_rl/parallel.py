@@ -123,8 +123,18 @@ def counted(
     return lambda _: on_progress(next(numbers), total)
 
 
-def _run_job(work: Callable[[Job], Arrays], job: Job, path: Path) -> None:
-    write_arrays(path, work(job))
+_WORK: list[Callable[[Any], Arrays]] = []
+"""Of this worker process."""
+
+
+def _start_worker(work: Callable[[Any], Arrays]) -> None:
+    die_with_parent()
+    _WORK.append(work)
+
+
+def _run_job(job: Any, path: Path) -> None:
+    """Do a job in a worker process."""
+    write_arrays(path, _WORK[0](job))
 
 
 def map_jobs(
@@ -140,7 +150,8 @@ def map_jobs(
     """Leave the arrays of ``work(job)`` in ``folder/NAME.npz`` for every job; what is there already is not done again.
 
     Args:
-        work: a module-level function (it is sent to worker processes); it must depend on nothing but its job.
+        work: a module-level function, or a partial of one with what all jobs share (it is sent to each worker process
+            once); it must depend on nothing but that and its job.
         jobs: name → job. The name must identify the job's content.
         folder: where results are left.
         n_workers: number of processes, default one per core; this process is one of them.
@@ -199,7 +210,7 @@ def _run_here(
         if (name := take()) is None:
             return
         try:
-            pool.submit(_run_job, work, jobs[name], paths[name]).add_done_callback(partial(go_on, name))
+            pool.submit(_run_job, jobs[name], paths[name]).add_done_callback(partial(go_on, name))
         except BrokenProcessPool as error:
             finished.put((name, error))
 
@@ -212,7 +223,9 @@ def _run_here(
         finished.put((name, future.exception()))
 
     context = multiprocessing.get_context("spawn")  # fork is unsafe beside torch's and the GL library's threads
-    with ProcessPoolExecutor(max(n_workers - 1, 1), mp_context=context, initializer=die_with_parent) as pool:
+    with ProcessPoolExecutor(
+        max(n_workers - 1, 1), mp_context=context, initializer=_start_worker, initargs=(work,)
+    ) as pool:
         with starting_children():  # submitting starts them
             for _ in range(n_workers - 1):
                 submit()
@@ -220,7 +233,7 @@ def _run_here(
         try:
             for _ in jobs:
                 if finished.empty() and (own := take()) is not None:
-                    _run_job(work, jobs[own], paths[own])
+                    write_arrays(paths[own], work(jobs[own]))
                     finished.put((own, None))
                 name, error = finished.get()
                 if error is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -81,3 +82,17 @@ def recorded(folder: Path, dataset_id: str) -> list[Recorded]:
     assert [bool(one.terminated[-1]) for one in found] == [False, True, False, False, False, False]
     assert len({len(one) for one in found}) == 2
     return found
+
+
+@pytest.fixture
+def discrete_id(folder: Path, dataset_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A copy of the dataset whose actions are of a Discrete space with 4 actions: row t of an episode is t mod 4."""
+    shutil.copytree(folder / "minari" / dataset_id, tmp_path / dataset_id)
+    with h5py.File(tmp_path / dataset_id / "data/main_data.hdf5", "r+") as file:
+        for episode in file.values():
+            n_steps = len(episode["actions"])
+            del episode["actions"]
+            episode["actions"] = np.arange(n_steps) % 4
+    (tmp_path / dataset_id / "zest_manifest.json").unlink(missing_ok=True)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    return dataset_id

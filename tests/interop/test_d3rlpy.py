@@ -14,7 +14,7 @@ import pytest
 from conftest import Recorded
 from d3rlpy.dataset import InfiniteBuffer, ReplayBuffer
 
-from zest_rl.export import Rewards, to_d3rlpy
+from zest_rl.export import Rewards, export, to_d3rlpy
 
 
 @pytest.fixture(params=["file", "to_d3rlpy"])
@@ -125,6 +125,28 @@ def test_the_decision_transformer_trains(dataset_id: str) -> None:
     )  # fmt: skip
     last = [algo.update(dataset.sample_trajectory_batch(16, 10))["loss"] for _ in range(20)]
     assert np.mean(last) < 0.9 * np.mean(first)
+
+
+@pytest.mark.parametrize("way", ["file", "to_d3rlpy"])
+def test_discrete_actions_are_known_as_such_and_learnt_from(
+    way: str, discrete_id: str, recorded: list[Recorded], tmp_path: Path
+) -> None:
+    if way == "file":
+        with export(discrete_id, "d3rlpy", tmp_path / "data.h5").path.open("rb") as file:
+            buffer = ReplayBuffer.load(file, InfiniteBuffer())
+    else:
+        buffer = to_d3rlpy(discrete_id)
+    assert buffer.dataset_info.action_space is d3rlpy.ActionSpace.DISCRETE
+    assert buffer.dataset_info.action_size == 4
+    for episode, own in zip(buffer.episodes, recorded, strict=True):
+        np.testing.assert_array_equal(episode.actions[:, 0], np.arange(len(own)) % 4)
+    d3rlpy.seed(0)
+    algo = d3rlpy.algos.DiscreteCQLConfig(batch_size=32, learning_rate=1e-3, encoder_factory=SMALL).create(device="cpu")
+    history = algo.fit(
+        buffer, n_steps=200, n_steps_per_epoch=100, logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
+        show_progress=False,
+    )  # fmt: skip
+    assert history[-1][1]["loss"] < history[0][1]["loss"]
 
 
 def test_its_own_loader_of_minari_datasets_still_shifts_episode_i_by_i_observations(

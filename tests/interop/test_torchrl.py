@@ -11,12 +11,12 @@ from conftest import Recorded, flat
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.data import ImmutableDatasetWriter, SliceSampler, TensorDictReplayBuffer, TensorStorage
+from torchrl.data import Categorical, ImmutableDatasetWriter, SliceSampler, TensorDictReplayBuffer, TensorStorage
 from torchrl.data.datasets import D4RLExperienceReplay, MinariExperienceReplay
-from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
-from torchrl.objectives import IQLLoss, SoftUpdate
+from torchrl.modules import NormalParamExtractor, ProbabilisticActor, QValueActor, TanhNormal
+from torchrl.objectives import DiscreteCQLLoss, IQLLoss, SoftUpdate
 
-from zest_rl.export import to_torchrl
+from zest_rl.export import export, to_torchrl
 
 
 @pytest.fixture(params=["folder", "to_torchrl"])
@@ -103,6 +103,30 @@ def test_iql_trains(data: TensorDict) -> None:
         history.append(losses["loss_actor"].item())
     assert np.isfinite(history).all()
     assert np.mean(history[-30:]) < np.mean(history[:30])
+
+
+@pytest.mark.parametrize("way", ["folder", "to_torchrl"])
+def test_discrete_actions_are_learnt_from_as_categories(way: str, discrete_id: str, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    data = (
+        to_torchrl(discrete_id)
+        if way == "to_torchrl"
+        else TensorDict.load_memmap(export(discrete_id, "torchrl", tmp_path / "data").path)
+    )
+    assert (data["action"].dtype, data["action"].shape) == (torch.int64, data.batch_size)
+    net = nn.Sequential(nn.Linear(data["observation"].shape[-1], 64), nn.ReLU(), nn.Linear(64, 4))
+    loss = DiscreteCQLLoss(QValueActor(net, in_keys=["observation"], spec=Categorical(4)), action_space="categorical")
+    loss.make_value_estimator(gamma=0.99)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    replay = TensorDictReplayBuffer(storage=TensorStorage(data), writer=ImmutableDatasetWriter(), batch_size=64)
+    history = []
+    for _ in range(200):
+        losses = loss(replay.sample())
+        optimizer.zero_grad()
+        (losses["loss_qvalue"] + losses["loss_cql"]).backward()
+        optimizer.step()
+        history.append(losses["loss_cql"].item())
+    assert np.mean(history[-20:]) < np.mean(history[:20])
 
 
 def test_its_own_loader_of_minari_datasets_still_returns_zeros(

@@ -63,11 +63,14 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     name = config.dataset.split("/")[-1]
     path = config.output or Path(f"{name}.{SUFFIXES[config.to]}")
     written = export(config.dataset, config.to, path, Rewards(config.shape, config.normalise), config.fps)
+    if written.left_out:
+        ui.warn(f"left out, as they are pictures or text: {', '.join(written.left_out)}")
     return {
         "file": str(written.path),
         "n_episodes": written.n_episodes,
         "n_transitions": written.n_transitions,
         "arrays": sorted(written.arrays),
+        "left_out": list(written.left_out),
         "bytes": written.n_bytes,
         "next": NEXT[config.to].format(path=written.path, name=name),
     }

@@ -85,8 +85,23 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "return_min": float(returns.min()),
         "return_max": float(returns.max()),
         "seconds": round(time.monotonic() - started, 2),
-        "next": f"zest train dt {result['dataset']}",
+        "next": _next(result["dataset"]),
     }
+
+
+def _next(dataset_id: str) -> str:
+    """Name a command that works on what a dataset observes and how it acts."""
+    import h5py
+
+    from zest_rl import data
+    from zest_rl.observations import entries, is_numbers
+
+    name = data.episode_names(dataset_id)[0]
+    with h5py.File(data.dataset_path(dataset_id) / data.DATA_FILE, "r") as file:
+        if not any(map(is_numbers, entries(file[name]["observations"]).values())):
+            return f"zest inspect {dataset_id}"
+        discrete = file[name]["actions"].ndim == 1
+    return f"zest export {dataset_id} --to npz" if discrete else f"zest train dt {dataset_id}"
 
 
 def _from_states(config: Config, ui: Ui) -> dict[str, Any]:

@@ -28,7 +28,16 @@ from zest_rl.errors import BadInput, nearest
 from zest_rl.export import d3rlpy, flat, lerobot, robomimic, torchrl
 from zest_rl.export.d3rlpy import to_d3rlpy
 from zest_rl.export.torchrl import to_torchrl
-from zest_rl.export.transitions import AS_RECORDED, Contents, Rewards, Shape, Transitions, read, transitions
+from zest_rl.export.transitions import (
+    AS_RECORDED,
+    Contents,
+    Rewards,
+    Shape,
+    Transitions,
+    read,
+    read_scores,
+    transitions,
+)
 
 __all__ = [
     "AS_RECORDED", "Exported", "Format", "Rewards", "Shape", "Transitions", "export", "to_d3rlpy", "to_torchrl",
@@ -60,15 +69,17 @@ class Exported:
     n_episodes: int
     n_transitions: int
     arrays: tuple[str, ...]
-    """Names of the arrays of `transitions`."""
+    """Names of the arrays of `transitions` that went into it."""
     n_bytes: int
+    left_out: tuple[str, ...]
+    """Entries of the observations that are no numbers: pictures and text."""
 
 
 def export(dataset_id: str, to: Format, path: Path, rewards: Rewards = AS_RECORDED, fps: int | None = None) -> Exported:
     """Write a dataset in another format, atomically.
 
     Args:
-        dataset_id: any dataset with flat observations.
+        dataset_id: any dataset with numbers among its observations; of pictures alone for ``lerobot-progress``.
         to: the format.
         path: the file, or the folder (`FOLDERS`); it must not exist.
         rewards: how the dataset's rewards are handed on.
@@ -85,7 +96,7 @@ def export(dataset_id: str, to: Format, path: Path, rewards: Rewards = AS_RECORD
         raise BadInput(f"{path} exists; delete it, or choose another --output")
     if to == "lerobot-progress" and rewards != AS_RECORDED:
         raise BadInput("lerobot-progress holds scores of frames and no rewards; leave --shape and --normalise out")
-    contents = read(dataset_id, rewards)
+    contents = read_scores(dataset_id) if to == "lerobot-progress" else read(dataset_id, rewards)
     if (
         to in WITHOUT_LAST_STEP
         and rewards.shape == "terminal"
@@ -106,4 +117,5 @@ def export(dataset_id: str, to: Format, path: Path, rewards: Rewards = AS_RECORD
             writer(temporary, contents)
     files = [file for file in (path, *path.rglob("*")) if file.is_file()]
     n_bytes = sum(file.stat().st_size for file in files)
-    return Exported(path, len(contents.episodes), len(contents), tuple(contents.episodes[0]), n_bytes)
+    arrays, left_out = tuple(contents.episodes[0]), tuple(contents.about["left_out"])
+    return Exported(path, len(contents.episodes), len(contents), arrays, n_bytes, left_out)

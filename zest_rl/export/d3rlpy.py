@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import h5py
 
+from zest_rl.errors import BadInput
 from zest_rl.export.transitions import AS_RECORDED, Contents, Rewards, Transitions, transitions
 
 if TYPE_CHECKING:
@@ -24,10 +25,21 @@ VERSION = "2.1"
 
 
 def fields(episode: Transitions) -> dict[str, object]:
-    """The fields of d3rlpy's `Episode`: observations (T, obs_dim), actions, rewards (T, 1), terminated."""
+    """The fields of d3rlpy's `Episode`: observations (T, obs_dim), actions, rewards (T, 1), terminated.
+
+    Actions are (T, act_dim) float32 or, of a Discrete space, (T, 1) int64, from which d3rlpy tells the kind of space.
+
+    Raises:
+        BadInput: several whole numbers per action, which d3rlpy would take for one.
+    """
+    actions = episode["actions"].reshape(len(episode["actions"]), -1)
+    if actions.dtype.kind == "i" and actions.shape[1] > 1:
+        raise BadInput(
+            f"d3rlpy takes one whole number per action, got {actions.shape[1]}; export to npz, d4rl or torchrl"
+        )
     return {
         "observations": episode["observations"],
-        "actions": episode["actions"],
+        "actions": actions,
         "rewards": episode["rewards"][:, None],
         "terminated": bool(episode["terminals"][-1]),
     }

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from zest_rl import artifacts
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.export.transitions import Contents, Transitions
+from zest_rl.export.transitions import Contents, Transitions, check_continuous
 from zest_rl.tasks import TASKS
 
 if TYPE_CHECKING:
@@ -46,9 +46,10 @@ def write(folder: Path, contents: Contents, fps: int | None = None) -> None:
     Without `fps` the steps per second are those that the dataset was recorded with, if it says so, else the kitchen's.
 
     Raises:
-        BadInput: `fps` is below 1.
+        BadInput: `fps` is below 1, or actions are whole numbers.
         ZestError: pyarrow is not installed.
     """
+    check_continuous(contents, "LeRobot")
     if fps is None:
         fps = max(1, round((contents.about["zest"] or {}).get("recorded", {}).get("fps", FPS)))
     if fps < 1:
@@ -93,11 +94,9 @@ def write_progress(path: Path, contents: Contents) -> None:
     """Write the side-car alone: index, episode_index, frame_index, progress_sparse, and zest_score as it is.
 
     Raises:
-        BadInput: the dataset was not relabeled.
         ZestError: pyarrow is not installed.
     """
-    if contents.scores is None:
-        raise BadInput("progress is read from ZeST scores, which this dataset has not; relabel it with `zest relabel`")
+    assert contents.scores is not None
     scores = np.concatenate([score[:-1] for score in contents.scores])
     low, size = scores.min(), np.ptp(scores)
     lengths = [len(score) - 1 for score in contents.scores]
@@ -136,6 +135,7 @@ def _columns(flat: Transitions, starts: NDArray[Any], fps: int) -> Columns:
         "next.zest_score": "zest_score",
         "next.gt_reward": "gt_reward",
         "next.source_reward": "source_reward",
+        "next.success": "success",
         "gt_episode_success": "gt_episode_success",
     }
     return columns | {name: flat[key] for name, key in extras.items() if key in flat}

@@ -8,8 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from zest_rl.errors import BadInput
-from zest_rl.export.transitions import Contents
+from zest_rl.export.transitions import Contents, check_continuous
 
 VALID_SHARE = 0.1
 """Of the episodes, for the mask ``valid``."""
@@ -18,12 +17,13 @@ VALID_SHARE = 0.1
 def write(path: Path, contents: Contents) -> None:
     """Write ``data/demo_I`` with ``obs/flat`` and ``next_obs/flat``; ``dones`` are terminals and timeouts alike.
 
+    One episode alone is in the mask ``train``, and ``valid`` is empty, which robomimic's SequenceDataset takes.
+
     Raises:
-        BadInput: one episode alone, which cannot be parted.
+        BadInput: actions are whole numbers.
     """
+    check_continuous(contents, "robomimic")
     episodes = contents.episodes
-    if len(episodes) < 2:
-        raise BadInput("robomimic's masks part the episodes into train and valid, which takes 2 or more; got 1")
     names = [f"demo_{i}" for i in range(len(episodes))]
     with h5py.File(path, "w") as file:
         group = file.create_group("data")
@@ -42,7 +42,7 @@ def write(path: Path, contents: Contents) -> None:
         env = {"env_name": spec["id"], "type": 2, "env_kwargs": spec.get("kwargs", {})}  # 2: a Gym environment
         group.attrs["env_args"] = json.dumps(env)
         group.attrs["about"] = json.dumps(contents.about)
-        n_valid = max(1, round(VALID_SHARE * len(names)))
+        n_valid = max(1, round(VALID_SHARE * len(names))) if len(names) > 1 else 0
         chosen = set(np.random.default_rng(0).permutation(len(names))[:n_valid].tolist())
         for mask, members in (("valid", chosen), ("train", set(range(len(names))) - chosen)):
             file.create_dataset(f"mask/{mask}", data=np.array([names[i].encode() for i in sorted(members)], dtype="S"))

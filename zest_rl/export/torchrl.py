@@ -38,7 +38,7 @@ def nested(contents: Contents) -> tuple[dict[str, NDArray[Any]], dict[str, NDArr
         "terminated": flat["terminals"],
         "truncated": flat["timeouts"],
     }
-    for name in sorted({"zest_score", "gt_reward", "source_reward"} & flat.keys()):
+    for name in sorted({"zest_score", "gt_reward", "source_reward", "success"} & flat.keys()):
         after[name] = flat[name]
     if "gt_episode_success" in flat:
         root["gt_episode_success"] = flat["gt_episode_success"][:, None]

@@ -10,11 +10,13 @@ import json
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl import data
 from zest_rl.errors import BadInput, nearest
+from zest_rl.observations import entries, is_numbers
 from zest_rl.types import FloatArray
 
 Shape = Literal["step", "difference", "terminal"]
@@ -58,6 +60,8 @@ class Rewards:
         ]
 
 
+SUCCESS = ("infos/source/success", "infos/success", "infos/is_success")
+"""Where datasets of other robots hold success by step: LeRobot's once relabeled; Adroit's and mazes'; Fetch's."""
 Transitions = dict[str, NDArray[Any]]
 """Equally long arrays of one episode, see `transitions`."""
 AS_RECORDED = Rewards()
@@ -73,13 +77,16 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
     Returns:
         observations, next_observations (T, obs_dim), actions (T, act_dim), rewards (T,) float32; terminals, timeouts
         (T,) bool; and where they are recorded, zest_score, gt_reward (T,) float32 after the action,
-        gt_episode_success (T,) bool, of the whole episode, and source_reward (T,) float32, which another robot's
-        dataset came with. A Dict of observations is flattened (`zest_rl.observations.numbers`).
+        gt_episode_success (T,) bool, of the whole episode, and source_reward (T,) float32 and success (T,) bool after
+        the action, which another robot's dataset came with. A Dict of observations is flattened
+        (`zest_rl.observations.numbers`), and so are actions of several dimensions; whole numbers among the actions are
+        int64, (T,) those of a Discrete space.
 
     Raises:
         BadInput: no such dataset, the rewards cannot be normalised, or are differences already.
     """
-    episodes = data.read_episodes(dataset_id)
+    episodes = data.read_episodes(dataset_id, discrete=True)
+    actions = _actions(dataset_id, [episode.actions for episode in episodes])
     made = data.read_metadata(dataset_id).get("zest", {}).get("relabel")
     before = [0.0] * len(episodes)
     extras: dict[str, list[NDArray[Any]]] = {}
@@ -96,6 +103,15 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
         truth = data.read_ground_truth(dataset_id)
         extras["gt_reward"] = [episode.rewards for episode in truth]
         extras["gt_episode_success"] = [np.full(len(episode.rewards), episode.success) for episode in truth]
+    widths = sorted({episode.obs.shape[1] for episode in episodes})
+    if len(widths) > 1:
+        raise BadInput(
+            f"the episodes of {dataset_id} must observe equally many numbers, got {widths}; where floats may be "
+            "pictures or numbers, declare bounds in the observation space: pictures are in [0, 1]"
+        )
+    success = _success(dataset_id)
+    if success is not None:
+        extras["success"] = success
     shaped = rewards.of([episode.rewards for episode in episodes], before)
     found = []
     for i, (episode, own) in enumerate(zip(episodes, shaped, strict=True)):
@@ -103,7 +119,7 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
         found.append(
             {
                 "observations": episode.obs[:-1],
-                "actions": episode.actions,
+                "actions": actions[i],
                 "rewards": own,
                 "next_observations": episode.obs[1:],
                 "terminals": last & episode.terminated,
@@ -122,10 +138,10 @@ class Contents:
     scores: list[FloatArray] | None
     """(T+1,) each: ZeST scores of all frames, the first one too; None when the dataset was not relabeled."""
     about: dict[str, Any]
-    """JSON-ready: what a reader may want to know of where the file comes from."""
+    """JSON-ready: what a reader may want to know of where the file comes from, and what of it is left out."""
 
     def __len__(self) -> int:
-        return sum(len(episode["rewards"]) for episode in self.episodes)
+        return sum(len(next(iter(episode.values()))) for episode in self.episodes)
 
     @property
     def flat(self) -> Transitions:
@@ -146,5 +162,56 @@ def read(dataset_id: str, rewards: Rewards = AS_RECORDED) -> Contents:
         "ref_min_score": metadata.get("ref_min_score"),
         "ref_max_score": metadata.get("ref_max_score"),
         "zest": metadata.get("zest"),
+        "left_out": _left_out(dataset_id),
     }
     return Contents(episodes, data.read_scores(dataset_id) if "zest_score" in episodes[0] else None, about)
+
+
+def read_scores(dataset_id: str) -> Contents:
+    """Read the scores alone, of a dataset that may hold pictures alone.
+
+    Raises:
+        BadInput: no such dataset, or it was not relabeled.
+    """
+    if "relabel" not in data.read_metadata(dataset_id).get("zest", {}):
+        raise BadInput("progress is read from ZeST scores, which this dataset has not; relabel it with `zest relabel`")
+    scores = data.read_scores(dataset_id)
+    return Contents([{"zest_score": score[1:]} for score in scores], scores, {"left_out": []})
+
+
+def _actions(dataset_id: str, episodes: list[FloatArray]) -> list[NDArray[Any]]:
+    """Give actions (T, act_dim) back the type and, where they are of a Discrete space, the shape that they have."""
+    name = data.episode_names(dataset_id)[0]
+    with h5py.File(data.dataset_path(dataset_id) / data.DATA_FILE, "r") as file:
+        stored = file[name]["actions"]
+        if stored.dtype.kind == "f":
+            return list(episodes)
+        return [one[:, 0].astype(np.int64) if stored.ndim == 1 else one.astype(np.int64) for one in episodes]
+
+
+def _success(dataset_id: str) -> list[NDArray[np.bool_]] | None:
+    """Read whether the task was done after each action: (T,) per episode; None where an episode does not hold it."""
+    found = []
+    names = data.episode_names(dataset_id)
+    with h5py.File(data.dataset_path(dataset_id) / data.DATA_FILE, "r") as file:
+        for episode in (file[name] for name in names):
+            path = next((path for path in SUCCESS if path in episode), None)
+            n_steps = len(episode["actions"])
+            if path is None or len(episode[path]) not in (n_steps, n_steps + 1):
+                return None
+            found.append(np.asarray(episode[path][-n_steps:], dtype=bool).reshape(n_steps, -1)[:, 0])
+    return found
+
+
+def check_continuous(contents: Contents, reader: str) -> None:
+    """Raise `BadInput` where the actions are whole numbers, which `reader` has no policies for."""
+    if contents.episodes[0]["actions"].dtype.kind == "i":
+        raise BadInput(f"{reader} takes continuous actions, got whole numbers; export to npz, d4rl, d3rlpy or torchrl")
+
+
+def _left_out(dataset_id: str) -> list[str]:
+    """Name the entries of the observations that are no numbers: pictures and text."""
+    name = data.episode_names(dataset_id)[0]
+    with h5py.File(data.dataset_path(dataset_id) / data.DATA_FILE, "r") as file:
+        found = entries(file[name]["observations"], "observations")
+        return [path for path, entry in found.items() if not is_numbers(entry)]

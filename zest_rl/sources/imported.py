@@ -17,6 +17,9 @@ from zest_rl.data import METADATA_FILE
 from zest_rl.errors import BadInput
 from zest_rl.types import FloatArray
 
+SOURCE_SUCCESS = "infos/source/success"
+"""Where it is kept (T+1,), beside the rewards; false at the reset."""
+
 
 @dataclass(frozen=True)
 class Imported:
@@ -29,6 +32,8 @@ class Imported:
     rewards: FloatArray
     """(T,) float32, NaN where none were recorded."""
     terminated: bool
+    success: NDArray[np.bool_] | None = None
+    """(T,) whether the task was done after each action; None where that was not recorded."""
 
     def __post_init__(self) -> None:
         n_steps = len(self.actions)
@@ -50,13 +55,14 @@ def dataset_id_of(path: Path) -> str:
 
 
 def fingerprint(episodes: Iterable[Imported]) -> str:
-    """Hash all that training may see of the episodes, but no rewards."""
+    """Hash all that training may see of the episodes, and success where it is kept, but no rewards."""
     return artifacts.hash_json(
         [
             [
                 sorted(episode.obs),
                 artifacts.hash_arrays(*(episode.obs[name] for name in sorted(episode.obs)), episode.actions),
                 episode.terminated,
+                *([] if episode.success is None else [artifacts.hash_arrays(episode.success)]),
             ]
             for episode in episodes
         ]
@@ -66,11 +72,13 @@ def fingerprint(episodes: Iterable[Imported]) -> str:
 def stored(episode: Imported) -> dict[str, NDArray[Any]]:
     """Return what `fill` writes of an episode but its rewards, under the names on disk."""
     last = np.arange(len(episode.actions)) == len(episode.actions) - 1
+    success = {} if episode.success is None else {SOURCE_SUCCESS: np.concatenate([[False], episode.success])}
     return {
         **{f"observations/{name}": values for name, values in episode.obs.items()},
         "actions": episode.actions,
         "terminations": last & episode.terminated,
         "truncations": last & (not episode.terminated),
+        **success,
     }
 
 
@@ -105,6 +113,7 @@ def fill(
                         rewards=episode.rewards,
                         terminations=arrays["terminations"],
                         truncations=arrays["truncations"],
+                        infos={"source": {"success": arrays[SOURCE_SUCCESS]}} if SOURCE_SUCCESS in arrays else {},
                     )
                 ]
             )

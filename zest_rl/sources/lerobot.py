@@ -36,6 +36,8 @@ from zest_rl.types import FloatArray, Frame
 INFO = Path("meta", "info.json")
 _NUMBERS = ("float16", "float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool")
 
+_OTHERS = ("action", "next.reward", "next.done", "next.truncated", "next.success")
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -49,7 +51,7 @@ class Rows:
     observed: tuple[str, ...]
     """Columns with numbers that are observed."""
     others: tuple[str, ...]
-    """Those of action, next.reward, next.done and next.truncated that there are."""
+    """Those of `_OTHERS` that there are."""
     fps: float
     """Steps per second."""
 
@@ -104,7 +106,8 @@ class Rows:
         rewards = columns.get("next.reward", np.full((n_steps, 1), np.nan, np.float32))[:, 0]
         done, truncated = (columns.get(f"next.{end}") for end in ("done", "truncated"))
         terminated = done is not None and truncated is not None and bool(done[-1, 0] and not truncated[-1, 0])
-        return Imported(obs, columns["action"], rewards, terminated)
+        success = columns["next.success"][:, 0] > 0 if "next.success" in columns else None
+        return Imported(obs, columns["action"], rewards, terminated, success)
 
 
 def _column(values: Any) -> FloatArray:
@@ -236,7 +239,7 @@ def open_lerobot(root: Path, keys: Sequence[str], *, with_frames: bool = True) -
     missing = sorted(path.relative_to(root).as_posix() for path in needed if not path.is_file())
     if missing:
         raise BadInput(f"{root} lacks {missing[0]} ({len(missing)} files in all); download the dataset whole")
-    others = tuple(name for name in ("action", "next.reward", "next.done", "next.truncated") if name in features)
+    others = tuple(name for name in _OTHERS if name in features)
     if "action" not in others:
         raise BadInput(f"{root} has no feature 'action', got {', '.join(features)}")
     rows_ = Rows(root, files, n_steps, observed, others, fps)
