@@ -29,7 +29,7 @@ from gymnasium_robotics.utils import mujoco_utils
 from minari.data_collector import EpisodeBuffer
 from PIL import Image
 
-from zest_rl import data
+from zest_rl import cli, data
 from zest_rl.data_writer import write_scored
 from zest_rl.embedders import load_embedder
 from zest_rl.errors import ZestError
@@ -552,11 +552,13 @@ def test_qpos_is_read_from_observations_where_they_hold_it_to_the_bit(env_id: st
     assert not frames.describe()["qpos_is_noisy"]
 
 
-def test_the_kitchens_noisy_positions_are_shown_and_told() -> None:
+def test_the_kitchens_noisy_positions_are_shown_and_told(goal: Path, capsys: pytest.CaptureFixture[str]) -> None:
     frames, qpos = observed_alone("FrankaKitchen-v1")
     assert 0 < np.abs(frames._recorded(0)["qpos"] - qpos).max() <= 0.001
     assert frames.describe()["qpos_is_noisy"]
     assert len(list(frames.read(0))) == len(qpos)
+    assert cli.main(["relabel", "some/random-v0", "--goal", str(goal), "--n-workers", "1"]) == 0
+    assert "warning: states are read from observations that the environment blurred" in capsys.readouterr().err
 
 
 def observed_alone(env_id: str, **kwargs: Any) -> tuple[Any, np.ndarray]:
@@ -1107,5 +1109,10 @@ def test_policies_are_trained_on_it_it_is_exported_and_inspected_and_not_evaluat
     np.testing.assert_array_equal(arrays_["rewards"], np.concatenate(data.read_rewards(made)))
     inspected = zest("inspect", made, "--output", tmp_path / "page.html")
     figures = inspected["datasets"][made]["figures"]
-    assert {"Value-order correlation", "Told by the step", "Saturated"} == figures.keys()
+    assert figures.keys() == {
+        "Value-order correlation", "Told by the step", "Straight in time", "Saturated", "Nothing to see",
+    }  # fmt: skip
+    still = [score[1:] == 0 for score in data.read_scores(made)]
+    assert sum(map(np.sum, still)) == data.read_metadata(made)["zest"]["relabel"]["n_still_frames"]
+    assert figures["Nothing to see"]["value"] == pytest.approx(np.mean([episode.mean() for episode in still]))
     assert made in (tmp_path / "page.html").read_text()

@@ -162,6 +162,8 @@ def _from_frames(config: Config, ui: Ui) -> dict[str, Any]:
         config.goal, config.embedder, config.features, config.similarity, config.precision, config.goal_share
     )
     ui.say(f"frames: {', '.join(source.frames.views)}")
+    if getattr(source.frames, "noisy", False):
+        ui.warn("states are read from observations that the environment blurred, so that what is shown trembles a little")
     with progress_in_parts(ui, "reading and embedding") as on_progress:
         relabeled = relabel_frames(
             source,
