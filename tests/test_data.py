@@ -343,9 +343,9 @@ def test_a_malformed_env_spec_is_refused(collected: str, spec: str) -> None:
 
 @pytest.mark.parametrize("name", ["gymnasium.envs.x:Y", "gymnasium_robotics.envs.x:Y", "zest_rl.envs:KitchenEnv"])
 def test_known_packages_are_trusted(name: str) -> None:
-    data.check_env_spec(json.dumps({"entry_point": name, "additional_wrappers": []}), "it")
+    data.check_env_spec(json.dumps({"entry_point": name, "additional_wrappers": []}), "it", "stop")
     with pytest.raises(BadInput, match="it would run code of"):
-        data.check_env_spec(json.dumps({"entry_point": name.replace(".", "_evil.", 1)}), "it")
+        data.check_env_spec(json.dumps({"entry_point": name.replace(".", "_evil.", 1)}), "it", "stop")
 
 
 # --- identity ---------------------------------------------------------------------------------------------------------

@@ -305,7 +305,7 @@ def test_a_study_of_real_video_is_one_call(
     table = (output / "table.md").read_text()
     for line in (
         "| | oven | drawer | mean |",
-        "at random, pool all, $ZEST_RENDERED",
+        "at random, pool all, $ZEST_RENDERED, $ZEST_FOOTAGE",
         "| paper: ASDD, S2R, CLIP | 30.0 | 35.0",
     ):
         assert line in table

@@ -10,7 +10,7 @@ Layout of one dataset, alignment in `zest_rl.types`::
                                 infos/gt/{reward, success} (T+1,), infos/zest/score (T+1,) once relabeled}
 
 Datasets of other environments may hold observations in a group (`zest_rl.observations`), no state and no ground truth;
-once relabeled, the rewards that they came with are ``infos/source/reward`` (T+1,), 0 at the reset.
+once relabeled, what they came with is ``infos/source/{reward, success}`` (T+1,), 0 at the reset.
 
 Ground truth is read by `read_ground_truth` alone; `read_episodes` and `read_states` never open it.
 """
@@ -33,14 +33,14 @@ from numpy.typing import NDArray
 
 from zest_rl import artifacts
 from zest_rl.errors import BadInput, ZestError, nearest
-from zest_rl.observations import entries, n_channels, numbers, stored_rows
+from zest_rl.observations import acts_discretely, entries, is_numbers, numbers, stored_rows
 from zest_rl.types import Episode, FloatArray, GroundTruth
 
 DATASET_ID = re.compile(r"(?:[A-Za-z0-9][\w.-]+/)*[A-Za-z0-9][\w.-]*-v\d+")
 TRUSTED_ENTRY_POINTS = ("gymnasium.", "gymnasium_robotics.", "zest_rl.")
 DATA_FILE, METADATA_FILE, MANIFEST_FILE = "data/main_data.hdf5", "data/metadata.json", "zest_manifest.json"
-SOURCE_REWARD = "infos/source/reward"
-"""Where the rewards of another environment's dataset are kept when it is relabeled."""
+SOURCE_REWARD, SOURCE_SUCCESS = "infos/source/reward", "infos/source/success"
+"""Where the rewards and successes of another environment's dataset are kept (T+1,) when it is relabeled."""
 _GT_REWARD = "infos/gt/reward"
 
 
@@ -114,7 +114,7 @@ def _entry_points(env_spec: str, what: str) -> list[str]:
         raise BadInput(f"{what} is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
 
 
-def check_env_spec(env_spec: str, what: str, instead: str = "") -> None:
+def check_env_spec(env_spec: str, what: str, instead: str) -> None:
     """Refuse a Gymnasium EnvSpec (JSON) that would run code of an unknown package: of its environment or a wrapper.
 
     Raises:
@@ -124,7 +124,7 @@ def check_env_spec(env_spec: str, what: str, instead: str = "") -> None:
         if not entry_point.startswith(TRUSTED_ENTRY_POINTS):
             raise BadInput(
                 f"{what} would run code of {entry_point!r}; only {', '.join(p + '*' for p in TRUSTED_ENTRY_POINTS)} "
-                f"are trusted{instead}"
+                f"are trusted; {instead}"
             )
 
 
@@ -175,18 +175,16 @@ def _each(dataset_id: str, read: Callable[[h5py.Group], Any]) -> list[Any]:
 
 def _observations(group: h5py.Group, dataset_id: str) -> FloatArray:
     node = group.get("observations")
-    if isinstance(node, h5py.Group) or (node is not None and n_channels(node) is not None):
+    if isinstance(node, h5py.Group) or (node is not None and node.ndim != 2):
         return numbers(node)
     return _array(group, "observations", np.float32, dataset_id)
 
 
 def _actions(group: h5py.Group, dataset_id: str, discrete: bool) -> FloatArray:
     actions = _array(group, "actions", np.float32, dataset_id)
-    if actions.ndim > 1 or discrete:
-        return actions.reshape(len(actions), math.prod(actions.shape[1:]))
-    if group["actions"].dtype.kind != "f":
+    if not discrete and acts_discretely(group):
         raise BadInput("its actions are discrete, a policy here acts by continuous ones; `zest export` takes them")
-    return actions
+    return actions.reshape(len(actions), math.prod(actions.shape[1:]))
 
 
 def episode_names(dataset_id: str) -> list[str]:
@@ -308,8 +306,7 @@ def read_source_rewards(dataset_id: str) -> list[FloatArray] | None:
 
 
 def rewards_to_keep(dataset_id: str) -> list[FloatArray | None]:
-    """Read the rewards (T,) of every episode that a relabeled copy keeps as its source's; None: none are there, or it
-    keeps the ground truth."""
+    """Read the rewards (T,) of every episode that a copy keeps as its source's; None: none, or the ground truth."""
 
     def read(group: h5py.Group) -> FloatArray | None:
         if _GT_REWARD in group:
@@ -340,7 +337,7 @@ def fingerprint(dataset_id: str) -> str:
 def _observed(node: h5py.Group | h5py.Dataset) -> Iterator[NDArray[Any]]:
     """Yield an episode's observations in parts: pictures as they are stored, a few at a time, numbers as float32."""
     for entry in entries(node).values():
-        if n_channels(entry) is None and entry.dtype.kind in "biuf":
+        if is_numbers(entry):
             yield np.asarray(entry[()], dtype=np.float32)
         else:
             yield from stored_rows(entry)

@@ -193,7 +193,7 @@ def rollout(
 
 def _kitchen_spec(env_spec: str) -> gymnasium.envs.registration.EnvSpec:
     """Read the EnvSpec of a run; the run may come from somebody else, so it must not run code of its choice."""
-    check_env_spec(env_spec, "the environment of the run")
+    check_env_spec(env_spec, "the environment of the run", "evaluate a run on a dataset of the kitchen")
     spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
     if spec.id != ENV_ID or spec.max_episode_steps is None:
         raise BadInput(

@@ -19,7 +19,7 @@ from zest_rl.types import FloatArray, GroundTruth
 
 CLOCK, STRAIGHT, SATURATED, STILL, CONTRADICTORY = 0.95, 0.9, 0.95, 0.9, 0.01
 """From these shares on a warning is given."""
-FLAT = 1e-3
+FLAT = 1e-5
 """Scores whose range is at most this share of the largest are constant, whatever rounding makes of them."""
 
 

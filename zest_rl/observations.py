@@ -50,6 +50,11 @@ def is_numbers(entry: h5py.Dataset) -> bool:
     return not n_channels(entry) and entry.dtype.kind in "biuf" and entry.ndim > 0
 
 
+def acts_discretely(episode: h5py.Group) -> bool:
+    """Whether the actions of an episode are whole numbers: Discrete, MultiDiscrete, MultiBinary."""
+    return bool(episode["actions"].dtype.kind != "f")
+
+
 def _form(entry: h5py.Dataset) -> int | None:
     if _is_jpeg(entry):
         return 3
@@ -69,10 +74,12 @@ def _are_shares(entry: h5py.Dataset) -> bool:
 def _declared_bounds(entry: h5py.Dataset) -> tuple[float, float]:
     """Return the lowest and the highest value of an entry's space, which Minari keeps beside its file."""
     metadata = Path(entry.file.filename).with_name("metadata.json")
-    _, _, path = entry.name.partition("/observations")
+    _, _, part, *names = entry.name.split("/")
     try:
+        if part != "observations":
+            raise KeyError(part)
         space = _observation_space(metadata, metadata.stat().st_mtime_ns)
-        for name in path.split("/")[1:]:
+        for name in names:
             parts = space["subspaces"]
             space = parts[int(name.removeprefix("_index_"))] if isinstance(parts, list) else parts[name]
         return float(np.min(space["low"])), float(np.max(space["high"]))

@@ -55,7 +55,7 @@ def run_jobs(
     the time of the work.
 
     Args:
-        work: a module-level function.
+        work: a module-level function, or a partial of one.
         jobs: name → job, both picklable.
         n_workers: workers at most; default one per GPU, or per core where there are none.
         device: what the work runs on; unless it is ``cpu``, each worker gets a GPU of its own where there are any.

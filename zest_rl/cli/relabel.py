@@ -92,16 +92,17 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 def _next(dataset_id: str) -> str:
     """Name a command that works on what a dataset observes and how it acts."""
     import h5py
+    import numpy as np
 
     from zest_rl import data
-    from zest_rl.observations import entries, is_numbers
+    from zest_rl.observations import acts_discretely, entries, is_numbers
 
-    name = data.episode_names(dataset_id)[0]
+    names = data.episode_names(dataset_id)
     with h5py.File(data.dataset_path(dataset_id) / data.DATA_FILE, "r") as file:
-        if not any(map(is_numbers, entries(file[name]["observations"]).values())):
+        if not any(map(is_numbers, entries(file[names[0]]["observations"]).values())):
             return f"zest inspect {dataset_id}"
-        discrete = file[name]["actions"].ndim == 1
-    return f"zest export {dataset_id} --to npz" if discrete else f"zest train dt {dataset_id}"
+        trains = all(not acts_discretely(file[name]) and np.abs(file[name]["actions"][()]).max() <= 1 for name in names)
+    return f"zest train dt {dataset_id}" if trains else f"zest export {dataset_id} --to npz"
 
 
 def _from_states(config: Config, ui: Ui) -> dict[str, Any]:
@@ -163,7 +164,7 @@ def _from_frames(config: Config, ui: Ui) -> dict[str, Any]:
     )
     ui.say(f"frames: {', '.join(source.frames.views)}")
     if getattr(source.frames, "noisy", False):
-        ui.warn("states are read from observations that the environment blurred, so that what is shown trembles a little")
+        ui.warn("states are read from observations that the environment blurred: what is shown trembles a little")
     with progress_in_parts(ui, "reading and embedding") as on_progress:
         relabeled = relabel_frames(
             source,

@@ -107,7 +107,7 @@ def read_study(path: Path) -> StudyPlan:
         if pool not in get_args(Pool):
             raise BadInput(f"{where} [grid]: unknown pool {pool!r}; {nearest(str(pool), get_args(Pool))}")
         if real:
-            pool = ", ".join([pool, *(str(setting[key]) for key in ("ask", "folder") if key in setting)])
+            pool = ", ".join([pool, *(str(setting[key]) for key in ("ask", "folder", "goals") if key in setting)])
         else:
             arguments = {**arguments, "datasets": []}
             arguments.pop("pool", None)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from zest_rl import data
 from zest_rl.errors import BadInput, nearest
-from zest_rl.observations import entries, is_numbers
+from zest_rl.observations import acts_discretely, entries, is_numbers
 from zest_rl.types import FloatArray
 
 Shape = Literal["step", "difference", "terminal"]
@@ -60,7 +60,7 @@ class Rewards:
         ]
 
 
-SUCCESS = ("infos/source/success", "infos/success", "infos/is_success")
+SUCCESS = (data.SOURCE_SUCCESS, "infos/success", "infos/is_success")
 """Where datasets of other robots hold success by step: LeRobot's once relabeled; Adroit's and mazes'; Fetch's."""
 Transitions = dict[str, NDArray[Any]]
 """Equally long arrays of one episode, see `transitions`."""
@@ -183,10 +183,10 @@ def _actions(dataset_id: str, episodes: list[FloatArray]) -> list[NDArray[Any]]:
     """Give actions (T, act_dim) back the type and, where they are of a Discrete space, the shape that they have."""
     name = data.episode_names(dataset_id)[0]
     with h5py.File(data.dataset_path(dataset_id) / data.DATA_FILE, "r") as file:
-        stored = file[name]["actions"]
-        if stored.dtype.kind == "f":
+        if not acts_discretely(file[name]):
             return list(episodes)
-        return [one[:, 0].astype(np.int64) if stored.ndim == 1 else one.astype(np.int64) for one in episodes]
+        alone = file[name]["actions"].ndim == 1
+    return [one[:, 0].astype(np.int64) if alone else one.astype(np.int64) for one in episodes]
 
 
 def _success(dataset_id: str) -> list[NDArray[np.bool_]] | None:

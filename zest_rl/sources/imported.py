@@ -13,12 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl import artifacts
-from zest_rl.data import METADATA_FILE
+from zest_rl.data import METADATA_FILE, SOURCE_SUCCESS
 from zest_rl.errors import BadInput
 from zest_rl.types import FloatArray
-
-SOURCE_SUCCESS = "infos/source/success"
-"""Where it is kept (T+1,), beside the rewards; false at the reset."""
 
 
 @dataclass(frozen=True)

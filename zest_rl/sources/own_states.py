@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.metadata
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import h5py
 import numpy as np
@@ -21,16 +23,32 @@ def registered(env_id: str) -> importlib.metadata.EntryPoint | None:
     return next((e for e in importlib.metadata.entry_points(group=ENTRY_POINTS) if e.name == env_id), None)
 
 
+def load(entry: importlib.metadata.EntryPoint) -> Callable[[Mapping[str, NDArray[Any]]], NDArray[Any]]:
+    """Return the function.
+
+    Raises:
+        ZestError: its module cannot be imported, or has no such function.
+    """
+    try:
+        function: Callable[[Mapping[str, NDArray[Any]]], NDArray[Any]] = entry.load()
+    except Exception as error:  # whatever somebody else's module raises
+        raise ZestError(
+            f"{entry.value}, which is registered for {entry.name}, cannot be loaded ({type(error).__name__}: {error})"
+        ) from error
+    return function
+
+
 def rebuild(entry: importlib.metadata.EntryPoint, episode: h5py.Group, n_rows: int) -> NDArray[np.float64]:
     """Return qpos (T+1, nq) of an episode in a Minari dataset.
 
     Raises:
         ZestError: the function fails, or returns anything else.
     """
+    build = load(entry)
     parts = [entries(episode[part], part) for part in ("observations", "infos") if part in episode]
     numbers = {path: node[()] for part in parts for path, node in part.items() if is_numbers(node)}
     try:
-        qpos = np.asarray(entry.load()(numbers), np.float64)
+        qpos = np.asarray(build(numbers), np.float64)
         if qpos.ndim != 2 or len(qpos) != n_rows or not np.isfinite(qpos).all():
             raise ValueError(f"qpos must be finite and of shape ({n_rows}, nq), got {qpos.shape}")
     except Exception as error:  # whatever somebody else's function raises

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.errors import BadInput
-from zest_rl.observations import choose_pictures, entries, is_numbers, n_channels
+from zest_rl.observations import choose_pictures, entries, is_numbers
 from zest_rl.sources import imported
 from zest_rl.sources.imported import Imported
 from zest_rl.sources.pictures import Pictures, picture_entries
@@ -110,7 +110,7 @@ def open_robomimic(path: Path, keys: Sequence[str], *, with_frames: bool = True)
                     + (f"{lacking[0]} lacks one of them (extract observations first)" if lacking else "it has none")
                 )
             n_steps = tuple(len(file[name]["actions"]) for name in names)
-            numbers = [e for e in entries(file[names[0]]["obs"]).values() if n_channels(e) is None]
+            numbers = [e for e in entries(file[names[0]]["obs"]).values() if is_numbers(e)]
             n_bytes = 4 * sum(n_steps) * (32 + sum(int(np.prod(e.shape[1:])) for e in numbers))
     except OSError as error:
         raise BadInput(f"{path} cannot be read as HDF5 ({error}); relabel takes robomimic's files") from error

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import atexit
 import functools
-import importlib
 import importlib.metadata
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -85,13 +84,13 @@ class States:
     env_spec: str
     """Of the environment, as JSON, checked."""
     qpos: Columns
-    """None: another package rebuilds it (`own_states`)."""
+    """Empty: another package rebuilds it (`own_states`)."""
     scenery: tuple[str, ...]
     """Paths of what else is put into the scene."""
     cameras: tuple[str, ...] = ()
     """Of the model; empty: where the environment's own camera stands."""
     pose: Pose | None = None
-    """Of that camera."""
+    """Of that camera; None where it is one of the model."""
     noisy: bool = False
     """Whether the observations that qpos is read from were blurred."""
 
@@ -182,7 +181,7 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
     spec = json.loads(env_spec)
     own = own_states.registered(str(spec.get("id")))
     if own is None:
-        check_env_spec(env_spec, f"the env_spec of {what}", "; give --frames FOLDER with a video of each episode")
+        check_env_spec(env_spec, f"the env_spec of {what}", "give --frames FOLDER with a video of each episode")
     entry_point, kwargs = str(spec["entry_point"]), spec.get("kwargs") or {}
     with h5py.File(file, "r") as opened:
         group = opened[episodes[0]]
@@ -225,7 +224,7 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
         raise BadInput(
             f"{what}: qpos must have {stage.model.nq} columns for {spec.get('id')}, got {len(start['qpos'])}"
         )
-    return states if cameras else replace(states, pose=stage.own_pose(start))
+    return states if cameras or stage.is_fixed else replace(states, pose=stage.own_pose(start))
 
 
 # --- the environment as a stage ---------------------------------------------------------------------------------------
@@ -253,7 +252,10 @@ class Stage:
             )
         self._renderer = _renderer_of(env)
         self._own = mujoco.MjvCamera()
-        if (fixed := getattr(self._renderer, "camera_id", -1)) >= 0:  # that the environment was made with
+        fixed = getattr(self._renderer, "camera_id", -1)
+        self.is_fixed = fixed >= 0
+        """Whether the environment was made with a camera of the model as its own."""
+        if self.is_fixed:
             self._own.type, self._own.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, fixed
         views = tuple(_camera(self.model, name) for name in cameras) or (self._own,)
         self._canvas = Canvas(self.model, views, SIZE)
@@ -303,7 +305,7 @@ def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
         raise BadInput(f"the dataset's env_spec is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
     own = own_states.registered(spec.id)
     if own is not None and spec.id not in gymnasium.registry:
-        importlib.import_module(own.module)  # it registers the environment
+        own_states.load(own)  # its module registers the environment
     check_registered(spec)
     spec.additional_wrappers = ()  # what they change is not shown, and they are code
     try:
