@@ -561,6 +561,14 @@ def test_the_kitchens_noisy_positions_are_shown_and_told(goal: Path, capsys: pyt
     assert "warning: states are read from observations that the environment blurred" in capsys.readouterr().err
 
 
+def test_an_environment_made_with_a_camera_of_its_model_is_seen_from_that() -> None:
+    frames, _ = observed_alone("HalfCheetah-v5", camera_name="track")
+    assert frames.describe()["camera_pose"] is None
+    named: Any = open_source("some/random-v0", cameras=["track"]).frames
+    for own, by_name in zip(frames.read(0), named.read(0), strict=True):
+        np.testing.assert_array_equal(own[0], by_name[0])
+
+
 def observed_alone(env_id: str, **kwargs: Any) -> tuple[Any, np.ndarray]:
     """Frames of a dataset without recorded states, and the states (T+1, nq) of its only episode."""
     env: Any = gymnasium.make(env_id, **kwargs)
@@ -709,20 +717,23 @@ def test_another_package_rebuilds_the_states_of_its_own_environment(
     assert "own_robot" not in sys.modules
 
     def register(function: str) -> None:
-        entry = f"[zest_rl.state_renderers]\nOwnReacher-v0 = own_robot:{function}\n"
+        entry = f"[zest_rl.state_renderers]\nOwnReacher-v0 = {function}\n"
         (about / "entry_points.txt").write_text(entry)
 
-    register("qpos")
+    register("own_robot:qpos")
     made = zest(*words)["dataset"]
     assert data.read_metadata(made)["zest"]["relabel"]["frames"]["qpos_from"] == "own_robot:qpos"
     frames: Any = open_source(dataset).frames
     for i, episode in enumerate(episodes):
         np.testing.assert_allclose(frames._recorded(i)["qpos"], [state["qpos"] for state in episode.state], atol=1e-6)
-    for function, message in (("short", "qpos must be finite and of shape (4, nq), got (3, 4)"), ("lost", "lost")):
+    for function, message in (
+        ("own_robot:short", "failed (ValueError: qpos must be finite and of shape (4, nq), got (3, 4))"),
+        ("own_robot:lost", "cannot be loaded (AttributeError: "),
+        ("no_robot:qpos", "cannot be loaded (ModuleNotFoundError: "),
+    ):
         register(function)
         code, error = refusal(*words)
-        assert (code, f"own_robot:{function}, which is registered for OwnReacher-v0, failed" in error) == (1, True)
-        assert message in error
+        assert (code, f"{function}, which is registered for OwnReacher-v0, {message}" in error) == (1, True), error
 
 
 # --- a folder beside the dataset --------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from zest_rl.errors import BadInput, ZestError
 from zest_rl.export import Rewards, export, transitions
 from zest_rl.export.lerobot import DATA_FILE
 from zest_rl.frames import Views
+from zest_rl.observations import is_numbers
 from zest_rl.relabel import relabel
 from zest_rl.scorer import ScorerConfig
 
@@ -405,6 +406,42 @@ def test_several_whole_numbers_per_action_are_not_taken_for_one(root: Path, tmp_
     with pytest.raises(BadInput, match="d3rlpy takes one whole number per action, got 2"):
         export(name, "d3rlpy", tmp_path / "x")
     assert not (tmp_path / "x").exists()
+    for i, space in enumerate((spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2))):
+        with pytest.raises(BadInput, match="its actions are discrete"):
+            data.read_episodes(write_minari(f"room/bits{i}-v0", root, spaces.Dict(ROOM), space))
+
+
+@pytest.mark.parametrize(
+    ("actions", "verb"),
+    [(spaces.Box(-2, 2, (2,), np.float32), "export"), (spaces.Box(-1, 1, (2,), np.float32), "train")],
+)
+def test_relabel_names_training_where_actions_can_be_trained_on(
+    root: Path, goal: Path, zest: Callable[..., dict[str, Any]], actions: spaces.Space[Any], verb: str
+) -> None:
+    name = write_minari("room/wide-v0", root, spaces.Dict(ROOM), actions)
+    assert zest("relabel", name, "--goal", goal, "--n-workers", "1")["next"].startswith(f"zest {verb} ")
+
+
+def test_infos_are_not_measured_by_the_space_of_the_observations(root: Path) -> None:
+    def infos(n_steps: int) -> dict[str, Any]:
+        return {"heat": np.full((n_steps + 1, 10, 10), 50.0)}
+
+    shares, actions = spaces.Box(0, 1, (16, 16), np.float32), spaces.Box(-1, 1, (2,), np.float32)
+    name = write_minari("room/heat-v0", root, shares, actions, infos=infos)
+    with h5py.File(root / name / "data/main_data.hdf5") as file:
+        assert is_numbers(file["episode_0/infos/heat"])
+        assert not is_numbers(file["episode_0/observations"])
+
+
+@pytest.mark.parametrize(
+    ("space", "n"), [(spaces.Box(-9, 9, (3, 4), np.float32), 12), (spaces.Discrete(5), 1), (ROOM["grid"], 100)]
+)
+def test_bare_observations_of_any_form_are_flattened(root: Path, space: spaces.Space[Any], n: int) -> None:
+    name = write_minari("room/bare-v0", root, space, spaces.Box(-1, 1, (2,), np.float32))
+    with h5py.File(root / name / "data/main_data.hdf5") as file:
+        for i, episode in enumerate(data.read_episodes(name)):
+            stored = file[f"episode_{i}/observations"][()]
+            np.testing.assert_array_equal(episode.obs, stored.reshape(-1, n).astype(np.float32))
 
 
 @pytest.mark.parametrize("to", ["npz", "d4rl", "robomimic", "d3rlpy", "torchrl", "lerobot"])

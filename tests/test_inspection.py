@@ -120,6 +120,7 @@ def test_constant_scores_and_constant_returns_are_warned_of() -> None:
     nearly = [np.float32(0.7) + np.float32(1e-6) * score for score in SCORES]
     assert "tell nothing apart" in warnings(nearly, figures)[0]
     assert warnings([np.float32(1e-6) * score for score in SCORES], figures) == [], "small is not constant"
+    assert warnings([np.float32(0.999) + np.float32(8e-4) * score for score in SCORES], figures) == []
     alike = [np.array([0.0, 1.0], np.float32), np.array([1.0, 0.0], np.float32)]
     assert "same return" in warnings(alike, figures)[0]
 

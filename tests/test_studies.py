@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from zest_rl.cli.studies import markdown, read_study
+from zest_rl.cli.studies import markdown, mean_over_tasks, read_study
 from zest_rl.errors import BadInput
 
 RECIPE = """
@@ -45,11 +45,20 @@ def write(folder: Path, text: str = RECIPE) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def _data(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """One Minari root and cache for all studies here: the first of them collects and embeds."""
+    root = tmp_path_factory.mktemp("data")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MINARI_DATASETS_PATH", str(root / "minari"))
+        patch.setenv("ZEST_CACHE", str(root / "cache"))
+        yield
+
+
+@pytest.mark.usefixtures("_data")
 def test_a_study_selects_in_every_cell_and_puts_the_paper_beside(
-    tmp_path: Path, zest: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, zest: Callable[..., dict[str, Any]]
 ) -> None:
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
     words = ("reproduce", write(tmp_path), "--output", tmp_path / "out", "--n-workers", "1")
     result = zest(*words)
     assert [row["name"] for row in result["rows"]] == [
@@ -74,13 +83,21 @@ def test_a_study_selects_in_every_cell_and_puts_the_paper_beside(
     for part in ("A tiny study", "paper: SGSD, CLIP", "at random, pool all", "Tiny."):
         assert part in page
     assert zest(*words)["rows"] == result["rows"]
+    recipe = write(
+        tmp_path,
+        'verb = "select goals"\ndatasets = ["zest/kitchen-micro-whole-v0"]\nviews = 1\ntolerance = 0.05\n'
+        'n_frames = 60\ntop = 3\ngoal = "drawings"\n',
+    )
+    of_verb = zest("reproduce", recipe, "--output", tmp_path / "verb", "--n-workers", "1")
+    assert {key: of_verb[key] for key in alone} == alone
+    assert json.loads((tmp_path / "verb" / "result.json").read_text())["top_n_success"] == alone["top_n_success"]
+    assert [path.name for path in (tmp_path / "verb").iterdir()] == ["result.json"], "select has no page"
 
 
+@pytest.mark.usefixtures("_data")
 def test_the_mean_of_repeats_has_a_standard_error_over_them(
-    tmp_path: Path, zest: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, zest: Callable[..., dict[str, Any]]
 ) -> None:
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
     drawn = RECIPE.replace("top = 3", "top = 3\nn_goals = 1\nn_repeats = 3").replace('"same-scene", ', "")
     result = zest("reproduce", write(tmp_path, drawn), "--output", tmp_path / "out", "--n-workers", "1")
     row = result["rows"][0]
@@ -90,6 +107,22 @@ def test_the_mean_of_repeats_has_a_standard_error_over_them(
     error = np.std(by_repeat, ddof=1) / np.sqrt(3)
     assert row["mean"]["top_n_standard_error_of_repeats"] == pytest.approx(error)
     assert f"± {100 * error:.1f} |" in (tmp_path / "out" / "table.md").read_text()
+
+
+def test_standard_errors_are_over_tasks_and_over_the_repeats_of_their_mean() -> None:
+    cells = {
+        task: {
+            "top_n_success": {"value": float(np.mean(repeats))},
+            "relative_variation": {"value": 0.5},
+            "goal_frame_ratio": 0.1,
+            "top_n_by_repeat": repeats,
+        }
+        for task, repeats in {"micro": [0.1, 0.5, 0.9], "sdoor": [0.3, 0.3, 0.6]}.items()
+    }
+    mean = mean_over_tasks(cells)
+    assert mean["top_n_success"] == pytest.approx(0.45)
+    assert mean["top_n_standard_error"] == pytest.approx(np.std([0.5, 0.4], ddof=1) / np.sqrt(2))
+    assert mean["top_n_standard_error_of_repeats"] == pytest.approx(np.std([0.2, 0.4, 0.75], ddof=1) / np.sqrt(3))
 
 
 def test_the_papers_mean_is_over_the_columns_that_are_shown() -> None:

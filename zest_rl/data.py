@@ -182,9 +182,10 @@ def _observations(group: h5py.Group, dataset_id: str) -> FloatArray:
 
 def _actions(group: h5py.Group, dataset_id: str, discrete: bool) -> FloatArray:
     actions = _array(group, "actions", np.float32, dataset_id)
-    if not discrete and acts_discretely(group):
+    whole = acts_discretely(group)
+    if whole and not discrete:
         raise BadInput("its actions are discrete, a policy here acts by continuous ones; `zest export` takes them")
-    return actions.reshape(len(actions), math.prod(actions.shape[1:]))
+    return actions.reshape(len(actions), math.prod(actions.shape[1:])) if actions.ndim > 1 or whole else actions
 
 
 def episode_names(dataset_id: str) -> list[str]:

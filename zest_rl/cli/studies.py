@@ -138,7 +138,7 @@ def run(path: Path, output: Path, ui: Ui, *, n_workers: int | None = None) -> di
         for setting in plan.settings:
             cells = _select(plan, setting, datasets, n_workers, ui, advance)
             about = {"name": setting.name, "setting": dict(setting.values), "pool": setting.pool}
-            rows.append({**about, "tasks": cells, "mean": _mean(cells)})
+            rows.append({**about, "tasks": cells, "mean": mean_over_tasks(cells)})
     result = {
         "study": plan.study.study,
         "title": plan.study.title,
@@ -185,7 +185,7 @@ def _select(
     return cells
 
 
-def _mean(cells: Mapping[str, Mapping[str, Any]]) -> dict[str, float | None]:
+def mean_over_tasks(cells: Mapping[str, Mapping[str, Any]]) -> dict[str, float | None]:
     """Mean over tasks of every figure; the standard error of the Top-N success over tasks, as the paper has it, and of
     its mean over tasks over the repeats, where goals or contexts were drawn anew.
     """
