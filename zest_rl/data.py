@@ -129,7 +129,12 @@ def check_env_spec(env_spec: str, what: str, instead: str) -> None:
 
 
 @contextmanager
-def _open(dataset_id: str) -> Iterator[tuple[h5py.File, list[str]]]:
+def open_episodes(dataset_id: str) -> Iterator[tuple[h5py.File, list[str]]]:
+    """Open the HDF5 file after checking all files as `read_metadata` does; yield it and its episodes' names, in order.
+
+    Raises:
+        BadInput: no such dataset, another storage than HDF5, or episodes are missing.
+    """
     read_metadata(dataset_id)
     path = dataset_path(dataset_id) / DATA_FILE
     try:
@@ -162,7 +167,7 @@ def _array(group: h5py.Group, name: str, dtype: type, dataset_id: str) -> NDArra
 
 def _each(dataset_id: str, read: Callable[[h5py.Group], Any]) -> list[Any]:
     results = []
-    with _open(dataset_id) as (file, names):
+    with open_episodes(dataset_id) as (file, names):
         for name in names:
             try:
                 results.append(read(file[name]))
@@ -189,12 +194,8 @@ def _actions(group: h5py.Group, dataset_id: str, discrete: bool) -> FloatArray:
 
 
 def episode_names(dataset_id: str) -> list[str]:
-    """Return the names of the episodes' groups in the HDF5 file, in order.
-
-    Raises:
-        BadInput: no such dataset, another storage than HDF5, or no episodes.
-    """
-    with _open(dataset_id) as (_, names):
+    """Return the names of the episodes' groups in the HDF5 file, in order; raises as `open_episodes` does."""
+    with open_episodes(dataset_id) as (_, names):
         return names
 
 

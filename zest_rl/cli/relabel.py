@@ -91,14 +91,12 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
 def _next(dataset_id: str) -> str:
     """Name a command that works on what a dataset observes and how it acts."""
-    import h5py
     import numpy as np
 
     from zest_rl import data
     from zest_rl.observations import acts_discretely, entries, is_numbers
 
-    names = data.episode_names(dataset_id)
-    with h5py.File(data.dataset_path(dataset_id) / data.DATA_FILE, "r") as file:
+    with data.open_episodes(dataset_id) as (file, names):
         if not any(map(is_numbers, entries(file[names[0]]["observations"]).values())):
             return f"zest inspect {dataset_id}"
         trains = all(not acts_discretely(file[name]) and np.abs(file[name]["actions"][()]).max() <= 1 for name in names)
@@ -163,7 +161,7 @@ def _from_frames(config: Config, ui: Ui) -> dict[str, Any]:
         config.goal, config.embedder, config.features, config.similarity, config.precision, config.goal_share
     )
     ui.say(f"frames: {', '.join(source.frames.views)}")
-    if getattr(source.frames, "noisy", False):
+    if source.frames.describe().get("qpos_is_noisy"):
         ui.warn("states are read from observations that the environment blurred: what is shown trembles a little")
     with progress_in_parts(ui, "reading and embedding") as on_progress:
         relabeled = relabel_frames(

@@ -51,22 +51,23 @@ class Config:
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Run all stages that are not done yet."""
+    started = time.monotonic()
+    result = _run(config, ui)
+    return {**result, "seconds": round(time.monotonic() - started, 1)}
+
+
+def _run(config: Config, ui: Ui) -> dict[str, Any]:
     from zest_rl import artifacts
     from zest_rl.comparison import overview
     from zest_rl.report import write_report
     from zest_rl.videos import ensure_videos, missing
 
-    started = time.monotonic()
     output = config.output or Path("runs") / config.file.stem
     recipe = read_recipe(config.file)
     if str(recipe.get("verb")) in STUDIES:
-        result = _run_verb(config, recipe, output, ui)
-        return {**result, "seconds": round(time.monotonic() - started, 1)}
+        return _run_verb(config, recipe, output, ui)
     if "study" in recipe:
-        return {
-            **studies.run(config.file, output, ui, n_workers=config.n_workers),
-            "seconds": round(time.monotonic() - started, 1),
-        }
+        return studies.run(config.file, output, ui, n_workers=config.n_workers)
     plan = read_plan(config.file)
     collected, datasets = {}, {}
     for task, collect_config in plan.collect.items():
@@ -75,7 +76,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         relabeled = tuple(dataset for of_task in datasets.values() for dataset in of_task.by_goal.values())
         inspected = inspect.run(inspect.Config(relabeled, output / "report.html", config.n_workers), ui)
         artifacts.write_json(output / "result.json", {**inspected, "provenance": artifacts.provenance()})
-        return {**inspected, "seconds": round(time.monotonic() - started, 1)}
+        return inspected
     cells = plan_cells(plan, datasets, output)
     ui.say(f"[3/4] train and evaluate {len(cells)} cells in {output / 'cells'}")
     n_run = run_cells(cells, output, ui, n_workers=config.n_workers)
@@ -118,7 +119,6 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "report": str(html),
         "result": str(output / "result.json"),
         "n_cells_run": n_run,
-        "seconds": round(time.monotonic() - started, 1),
         "next": f"open {html} in a browser",
     }
 

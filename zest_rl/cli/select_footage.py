@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -103,21 +103,23 @@ def run(config: FootageArguments, ui: Ui) -> dict[str, Any]:
         own = [i for i, clip in enumerate(goal_clips) if clip.thing == thing]
         drawn = np.random.default_rng(0).permutation(own)[: config.n_repeats].tolist()
         pools = (
-            footage.candidates(
-                clips,
-                embeddings,
-                thing,
-                diverse=config.pool == "all",
-                any_thing=config.ask == "actions",
-                same_context=config.context == "same",
-                left_out=goal if within else None,
-                seed=repeat,
+            (
+                footage.candidates(
+                    clips,
+                    embeddings,
+                    thing,
+                    diverse=config.pool == "all",
+                    any_thing=config.ask == "actions",
+                    same_context=config.context == "same",
+                    left_out=goal if within else None,
+                    seed=repeat,
+                ),
+                goals[goal],
             )
             for repeat, goal in enumerate(drawn)
         )
-        rows[thing] = _judge(config, pools, [goals[goal] for goal in drawn]) | {
-            "n_clips": sum(clip.thing == thing for clip in clips)
-        }
+        judged = _judge(config, pools)
+        rows[thing] = {**judged, "n_clips": sum(clip.thing == thing for clip in clips)}
         if rows[thing]["top"] < config.top:
             n = rows[thing]["top"]
             ui.warn(f"{thing!r}: only {n} frames reach the goal, so the highest {n} are judged")
@@ -134,7 +136,7 @@ def run(config: FootageArguments, ui: Ui) -> dict[str, Any]:
     }
 
 
-def _judge(config: FootageArguments, pools: Iterable[Frames], goals: Sequence[FloatArray]) -> dict[str, Any]:
+def _judge(config: FootageArguments, pools: Iterable[tuple[Frames, FloatArray]]) -> dict[str, Any]:
     """Score each pool of candidates by the first and last of its goal's (n, D) embeddings; average the measures."""
     import numpy as np
 
@@ -142,7 +144,7 @@ def _judge(config: FootageArguments, pools: Iterable[Frames], goals: Sequence[Fl
     from zest_rl.metrics import bootstrap
 
     tops, variations, ratios, picked = [], [], [], []
-    for pool, goal in zip(pools, goals, strict=True):
+    for pool, goal in pools:
         scores = pool.scores(goal[:1], goal[-1:], config.features, config.similarity)
         tops.append(selection.top_up_to(scores, pool.satisfies, config.top))
         variations.append(selection.relative_variation(scores, pool.satisfies))

@@ -86,7 +86,7 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
         BadInput: no such dataset, the rewards cannot be normalised, or are differences already.
     """
     episodes = data.read_episodes(dataset_id, discrete=True)
-    actions = _actions(dataset_id, [episode.actions for episode in episodes])
+    actions, success = _beside(dataset_id, [episode.actions for episode in episodes])
     made = data.read_metadata(dataset_id).get("zest", {}).get("relabel")
     before = [0.0] * len(episodes)
     extras: dict[str, list[NDArray[Any]]] = {}
@@ -109,7 +109,6 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
             f"the episodes of {dataset_id} must observe equally many numbers, got {widths}; where floats may be "
             "pictures or numbers, declare bounds in the observation space: pictures are in [0, 1]"
         )
-    success = _success(dataset_id)
     if success is not None:
         extras["success"] = success
     shaped = rewards.of([episode.rewards for episode in episodes], before)
@@ -179,28 +178,31 @@ def read_scores(dataset_id: str) -> Contents:
     return Contents([{"zest_score": score[1:]} for score in scores], scores, {"left_out": []})
 
 
-def _actions(dataset_id: str, episodes: list[FloatArray]) -> list[NDArray[Any]]:
-    """Give actions (T, act_dim) back the type and, where they are of a Discrete space, the shape that they have."""
-    name = data.episode_names(dataset_id)[0]
-    with h5py.File(data.dataset_path(dataset_id) / data.DATA_FILE, "r") as file:
-        if not acts_discretely(file[name]):
-            return list(episodes)
-        alone = file[name]["actions"].ndim == 1
-    return [one[:, 0].astype(np.int64) if alone else one.astype(np.int64) for one in episodes]
+def _beside(dataset_id: str, actions: list[FloatArray]) -> tuple[list[NDArray[Any]], list[NDArray[np.bool_]] | None]:
+    """Read what episodes do not tell: how actions (T, act_dim) are stored, and success after each.
+
+    Returns:
+        The actions, with the type and, where they are of a Discrete space, the shape that they have; and per episode
+        (T,), None where an episode does not hold it.
+    """
+    with data.open_episodes(dataset_id) as (file, names):
+        episodes = [file[name] for name in names]
+        whole, alone = acts_discretely(episodes[0]), episodes[0]["actions"].ndim == 1
+        success = [_success(episode) for episode in episodes]
+    known = [one for one in success if one is not None]
+    as_stored: list[NDArray[Any]] = [
+        (one[:, 0] if alone else one).astype(np.int64) if whole else one for one in actions
+    ]
+    return as_stored, known if len(known) == len(success) else None
 
 
-def _success(dataset_id: str) -> list[NDArray[np.bool_]] | None:
-    """Read whether the task was done after each action: (T,) per episode; None where an episode does not hold it."""
-    found = []
-    names = data.episode_names(dataset_id)
-    with h5py.File(data.dataset_path(dataset_id) / data.DATA_FILE, "r") as file:
-        for episode in (file[name] for name in names):
-            path = next((path for path in SUCCESS if path in episode), None)
-            n_steps = len(episode["actions"])
-            if path is None or len(episode[path]) not in (n_steps, n_steps + 1):
-                return None
-            found.append(np.asarray(episode[path][-n_steps:], dtype=bool).reshape(n_steps, -1)[:, 0])
-    return found
+def _success(episode: h5py.Group) -> NDArray[np.bool_] | None:
+    """Read whether the task was done after each action: (T,); None where that is not held."""
+    path = next((path for path in SUCCESS if path in episode), None)
+    n_steps = len(episode["actions"])
+    if path is None or len(episode[path]) not in (n_steps, n_steps + 1):
+        return None
+    return np.asarray(episode[path][-n_steps:], dtype=bool).reshape(n_steps, -1)[:, 0]
 
 
 def check_continuous(contents: Contents, reader: str) -> None:
@@ -211,7 +213,6 @@ def check_continuous(contents: Contents, reader: str) -> None:
 
 def _left_out(dataset_id: str) -> list[str]:
     """Name the entries of the observations that are no numbers: pictures and text."""
-    name = data.episode_names(dataset_id)[0]
-    with h5py.File(data.dataset_path(dataset_id) / data.DATA_FILE, "r") as file:
-        found = entries(file[name]["observations"], "observations")
+    with data.open_episodes(dataset_id) as (file, names):
+        found = entries(file[names[0]]["observations"], "observations")
         return [path for path, entry in found.items() if not is_numbers(entry)]
