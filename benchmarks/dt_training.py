@@ -18,7 +18,14 @@ from torch import Tensor, nn
 from transformers import DecisionTransformerConfig, DecisionTransformerModel
 
 from zest_rl.agents import dt
-from zest_rl.agents.base import Batch, DataFacts, Precision, autocast, describe_data, resolve_precision
+from zest_rl.agents.base import (
+    Batch,
+    DataFacts,
+    Precision,
+    autocast,
+    describe_data,
+    resolve_precision,
+)
 from zest_rl.types import Episode
 
 OBS_DIM, ACT_DIM, N_STEPS, N_EPISODES = 59, 9, 100, 100  # as the kitchen's datasets
@@ -77,7 +84,7 @@ def plain_update() -> Callable[[Batch], None]:
 
 
 def our_update(facts: DataFacts) -> tuple[nn.Module, Callable[[Batch], None]]:
-    """Return the model and the update of `zest_rl.training`, in the precision that it would choose here."""
+    """Return the model and the update of `zest_rl.training.loop`, in the precision that it would choose here."""
     model = dt.build_model(dt.DTConfig(), facts).train()
     precision = resolve_precision("auto", CPU)
 

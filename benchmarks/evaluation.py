@@ -19,11 +19,11 @@ import gymnasium
 import numpy as np
 
 from zest_rl.agents import AGENTS, load_policy
-from zest_rl.collect import Behaviour, env_spec, rollout
-from zest_rl.envs import HORIZON
-from zest_rl.evaluation import EvaluationConfig, evaluate, target_return
-from zest_rl.parallel import n_cores, one_thread
-from zest_rl.training import train
+from zest_rl.evaluation.evaluate import EvaluationConfig, evaluate, target_return
+from zest_rl.kitchen.collect import Behaviour, env_spec, rollout
+from zest_rl.kitchen.env import HORIZON
+from zest_rl.runtime.parallel import n_cores, one_thread
+from zest_rl.training.loop import train
 from zest_rl.types import Episode
 
 REQUIRED_SHARE = 0.7

@@ -1,4 +1,4 @@
-"""From recorded states to rewards: `zest_rl.relabel` against the loop that one would write, and scoring once more.
+"""From recorded states to rewards: `zest_rl.rewards.relabel` against the loop that one would write, and scoring again.
 
 The plain loop renders each frame with ``env.render()`` of gymnasium-robotics' FrankaKitchen-v1 and embeds it on its own
 through timm in fp32, one view; it is timed on a few frames. Ours is the whole of `relabel` on an empty cache, 8 views:
@@ -22,14 +22,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl import artifacts, collect, data, embed
-from zest_rl.data_writer import write_dataset
-from zest_rl.embed import STATES_PER_SHARD
-from zest_rl.frames import Views, distinct_states
-from zest_rl.parallel import chunks, concatenate, one_thread, write_arrays
-from zest_rl.relabel import relabel
-from zest_rl.rendering import select_gl_backend
-from zest_rl.scorer import Scorer, ScorerConfig
+from zest_rl.data import reader
+from zest_rl.data.writer import write_dataset
+from zest_rl.kitchen import collect
+from zest_rl.rewards import state_embeddings
+from zest_rl.rewards.relabel import relabel
+from zest_rl.rewards.scorer import Scorer, ScorerConfig
+from zest_rl.rewards.state_embeddings import STATES_PER_SHARD
+from zest_rl.runtime import artifacts
+from zest_rl.runtime.parallel import chunks, concatenate, one_thread, write_arrays
+from zest_rl.simulation.rendering import select_gl_backend
+from zest_rl.simulation.views import Views, distinct_states
 
 REQUIRED_RATIO = 25.0
 REQUIRED_RESCORING_S = 2.0
@@ -99,7 +102,7 @@ def relabel_ms(episodes: dict[str, NDArray[Any]]) -> tuple[Scorer, float, float]
     start = cpu_seconds()
     made = relabel(DATASET, CONFIG, n_workers=1)
     milliseconds = 1e3 * (cpu_seconds() - start) / CONFIG.views.n_views
-    assert np.ptp([episode.rewards.sum() for episode in data.read_episodes(made.dataset_id)]) > 0
+    assert np.ptp([episode.rewards.sum() for episode in reader.read_episodes(made.dataset_id)]) > 0
     return made.scorer, milliseconds / made.n_frames, milliseconds / made.scorer.states.n_embedded
 
 
@@ -123,7 +126,7 @@ def rescoring_seconds(config: ScorerConfig, episodes: list[NDArray[np.float64]])
     seconds = []
     for _ in range(N_ROUNDS):
         shutil.rmtree(artifacts.cache_dir() / "goals", ignore_errors=True)
-        embed._read_shard.cache_clear()
+        state_embeddings._read_shard.cache_clear()
         start = cpu_seconds()
         scorer = Scorer.build(config, episodes[0][0], n_workers=1)
         scores, _ = scorer.score_episodes(episodes)

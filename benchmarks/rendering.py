@@ -1,4 +1,4 @@
-"""CPU time per 224x224 kitchen frame: `zest_rl.rendering` against ``env.render()`` of gymnasium-robotics.
+"""CPU time per 224x224 kitchen frame: `zest_rl.simulation.rendering` against ``env.render()`` of gymnasium-robotics.
 
 Both draw on the same machine, in the same process, with the same GL backend. The clock is the processor time of all
 threads of the process, because software GL may spread a frame over several cores.
@@ -13,8 +13,8 @@ import gymnasium_robotics
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.rendering import N_QPOS, RenderConfig, StateRenderer, ring, select_gl_backend
-from zest_rl.tasks import TASKS
+from zest_rl.kitchen.tasks import TASKS
+from zest_rl.simulation.rendering import N_QPOS, RenderConfig, StateRenderer, ring, select_gl_backend
 
 SIZE = 224
 REQUIRED_RATIO = 40.0

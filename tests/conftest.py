@@ -36,9 +36,9 @@ COLLECTED = "zest/kitchen-micro-tiny-v0"
 
 def collect_some(dataset_id: str, task: str, n_episodes: int) -> None:
     """Leave a few noisy episodes of the expert in the Minari root."""
-    from zest_rl import collect
-    from zest_rl.data_writer import write_dataset
-    from zest_rl.parallel import concatenate
+    from zest_rl.data.writer import write_dataset
+    from zest_rl.kitchen import collect
+    from zest_rl.runtime.parallel import concatenate
 
     behaviour = collect.Behaviour(task, "expert", noise_max=1.0)
     episodes = concatenate([collect.rollout(behaviour, index) for index in range(n_episodes)])
@@ -85,9 +85,9 @@ def trained_root(collected_root: Path, tmp_path_factory: pytest.TempPathFactory)
     """
     from zest_rl.cli import train
     from zest_rl.cli.ui import SilentUi
-    from zest_rl.frames import Views
-    from zest_rl.relabel import relabel
-    from zest_rl.scorer import ScorerConfig
+    from zest_rl.rewards.relabel import relabel
+    from zest_rl.rewards.scorer import ScorerConfig
+    from zest_rl.simulation.views import Views
 
     root = tmp_path_factory.mktemp("trained")
     shutil.copytree(collected_root, root / "minari")
@@ -123,7 +123,7 @@ def trained(trained_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 @pytest.fixture(scope="module")
 def short_videos() -> Iterator[None]:
     """Write the first 2 states of a video only."""
-    from zest_rl import videos
+    from zest_rl.simulation import videos
 
     write_video = videos.write_video
 

@@ -138,7 +138,7 @@ def test_the_ground_truth_of_a_dataset_is_read_only_where_reports_are_made() -> 
 def test_ground_truth_read_from_states_is_for_judging_alone() -> None:
     users = {module_name(path) for path in SOURCES if "progress_of" in path.read_text()}
     assert users == {"envs", "candidates"}
-    importers = {module_name(path) for path in SOURCES if "zest_rl.candidates import" in path.read_text()}
+    importers = {module_name(path) for path in SOURCES if "zest_rl.analysis.frame_selection import" in path.read_text()}
     assert importers == {"cli.select"}
 
 

@@ -56,7 +56,7 @@ def exports(folder: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def dataset_id(folder: Path) -> str:
-    """Of the exported dataset; `zest_rl.data` finds it too."""
+    """Of the exported dataset; `zest_rl.data.reader` finds it too."""
     os.environ["MINARI_DATASETS_PATH"] = str(folder / "minari")
     return (folder / "dataset_id").read_text()
 

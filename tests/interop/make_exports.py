@@ -16,7 +16,7 @@ from typing import Any
 
 import h5py
 
-from zest_rl.data import MANIFEST_FILE
+from zest_rl.data.reader import MANIFEST_FILE
 
 ZEST = Path(sys.executable).with_name("zest")
 FORMATS = ("npz", "d4rl", "robomimic", "d3rlpy", "torchrl", "lerobot", "lerobot-progress")

@@ -29,7 +29,7 @@ build() {
 
 # A policy that d3rlpy trained acts in the kitchen, in d3rlpy's own Python.
 comes_back() {
-    [ "$1" != d3rlpy ] || ZEST_D3RLPY_PYTHON=$PWD/.venvs/d3rlpy/bin/python .venv/bin/python -m pytest -q tests/test_foreign.py -k d3rlpy
+    [ "$1" != d3rlpy ] || ZEST_D3RLPY_PYTHON=$PWD/.venvs/d3rlpy/bin/python .venv/bin/python -m pytest -q tests/agents/test_foreign.py -k d3rlpy
 }
 
 is_built() {

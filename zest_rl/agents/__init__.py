@@ -15,8 +15,8 @@ import torch
 
 from zest_rl.agents import bc, dt, foreign
 from zest_rl.agents.base import Agent, DataFacts, Policy
-from zest_rl.artifacts import hash_bytes, read_json
 from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.runtime.artifacts import hash_bytes, read_json
 
 __all__ = ["AGENTS", "Agent", "Policy", "get_agent", "load_policy"]
 

@@ -116,7 +116,7 @@ def autocast(precision: Precision, device: torch.device) -> torch.autocast:
 
 
 class OptimizerConfig(Protocol):
-    """The fields of a config that `zest_rl.training` reads; all others are the agent's own."""
+    """The fields of a config that `zest_rl.training.loop` reads; all others are the agent's own."""
 
     @property
     def learning_rate(self) -> float:
@@ -203,7 +203,7 @@ ConfigT = TypeVar("ConfigT")
 
 @dataclass(frozen=True)
 class Agent(Generic[ConfigT]):
-    """One algorithm as `zest_rl.training` sees it."""
+    """One algorithm as `zest_rl.training.loop` sees it."""
 
     config: type[ConfigT]
     """Flat frozen dataclass with the fields of `OptimizerConfig`; checks itself."""

@@ -25,7 +25,7 @@ from contextlib import suppress
 from typing import IO, Any
 
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.parallel import THREAD_VARIABLES
+from zest_rl.runtime.parallel import THREAD_VARIABLES
 from zest_rl.types import FloatArray
 
 TIMEOUT_VARIABLE, TIMEOUT = "ZEST_POLICY_TIMEOUT", 120.0

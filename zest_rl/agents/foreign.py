@@ -34,8 +34,8 @@ from numpy.typing import NDArray
 
 from zest_rl.agents.base import check_obs
 from zest_rl.agents.child import Child
-from zest_rl.artifacts import hash_file
 from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.runtime.artifacts import hash_file
 from zest_rl.types import FloatArray
 
 FOREIGN = "foreign"
@@ -257,7 +257,7 @@ def _call(policy: Act, method: str, *arguments: Any) -> None:
 
 
 def load(run_dir: Path, meta: dict[str, Any], device: torch.device) -> ForeignPolicy:
-    """Return the policy of a run that `zest_rl.adoption.adopt` made.
+    """Return the policy of a run that `zest_rl.training.adoption.adopt` made.
 
     Raises:
         BadInput: a file cannot be read, or its family is not known here.

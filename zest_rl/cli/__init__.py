@@ -23,10 +23,10 @@ from types import ModuleType
 from typing import Any
 
 from zest_rl import __version__
-from zest_rl.cli.recipes import COMMON_FLAGS, parse_config
+from zest_rl.cli.config import COMMON_FLAGS, parse_config
 from zest_rl.cli.ui import StreamUi
-from zest_rl.distributed import launched
 from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.training.distributed import launched
 
 VERBS = {
     "doctor": "check versions, rendering, weights and disk; say how to mend each",

@@ -37,24 +37,25 @@ class Config:
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Hash, copy, try."""
-    from zest_rl import artifacts, data
-    from zest_rl.adoption import adopt
     from zest_rl.agents.foreign import identify
-    from zest_rl.relabel import SCORER_FILE
+    from zest_rl.data import reader
+    from zest_rl.rewards.relabel import SCORER_FILE
+    from zest_rl.runtime import artifacts
+    from zest_rl.training.adoption import adopt
 
     source = identify(config.policy, config.python)
     name = config.name if config.name is not None else f"{_stem(source.words[-1])} ({source.family})"
-    described = data.describe(config.dataset)
+    described = reader.describe(config.dataset)
     slug = re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")
     digest = artifacts.hash_json([source.described(), name, described])[:8]
     default = Path("runs") / f"{config.dataset.split('/')[-1]}-{slug}-seed{config.seed}-{digest}"
     run_dir = config.run_dir or default
     ui.say(f"trying {config.policy} and copying it to {run_dir}")
-    scorer = data.dataset_path(config.dataset) / SCORER_FILE
+    scorer = reader.dataset_path(config.dataset) / SCORER_FILE
     adopt(
         source,
         name,
-        data.read_episodes(config.dataset),
+        reader.read_episodes(config.dataset),
         run_dir,
         seed=config.seed,
         meta={"dataset": described},

@@ -10,7 +10,7 @@ from zest_rl.cli.ui import Ui
 from zest_rl.errors import BadInput
 
 if TYPE_CHECKING:
-    from zest_rl.collect import Behaviour
+    from zest_rl.kitchen.collect import Behaviour
 
 FLAWS = ("noise_max", "stop_share", "slow_max", "bias_max", "grip_max")
 
@@ -63,7 +63,7 @@ class Config:
         Raises:
             BadInput: a number is out of range.
         """
-        from zest_rl.collect import Behaviour
+        from zest_rl.kitchen.collect import Behaviour
 
         given = {name: value for name, value in self.flaws.items() if value != "calibrate"}
         return Behaviour(self.task, "expert", seed=self.seed, **given)
@@ -86,17 +86,20 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
     import numpy as np
 
-    from zest_rl import artifacts, collect, data, metrics
-    from zest_rl.data_writer import write_dataset
-    from zest_rl.envs import ENV_ID
+    from zest_rl.data import reader
+    from zest_rl.data.writer import write_dataset
+    from zest_rl.kitchen import collect
+    from zest_rl.kitchen.env import ENV_ID
+    from zest_rl.metrics import statistics
+    from zest_rl.runtime import artifacts
 
     behaviour = config.behaviour()
     dataset_id = config.dataset_id
     asked = {key: value for key, value in asdict(config).items() if key not in ("dataset", "n_workers")}
     asked["env"] = ENV_ID
-    path = data.dataset_path(dataset_id)
-    if data.exists(dataset_id):
-        made_by = data.read_metadata(dataset_id).get("zest", {}).get("collect", {})
+    path = reader.dataset_path(dataset_id)
+    if reader.exists(dataset_id):
+        made_by = reader.read_metadata(dataset_id).get("zest", {}).get("collect", {})
         if not _is_same(asked, made_by):
             raise BadInput(
                 f"dataset {dataset_id} exists and was collected with other arguments, or in another version of the "
@@ -123,7 +126,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         )
     with ui.progress("episodes", config.n_episodes) as advance:
         episodes = collect.run_behaviour(behaviour, config.n_episodes, n_workers=config.n_workers, on_progress=advance)
-    normalized = metrics.normalized_return(collect.returns(episodes), references.minimum, references.expert)
+    normalized = statistics.normalized_return(collect.returns(episodes), references.minimum, references.expert)
     successes = episodes["gt_success"].any(axis=1)
     result = {
         "n_episodes": config.n_episodes,
@@ -131,7 +134,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "expert_return": references.expert,
         "expert_success": references.expert_success,
         "minimum_return": references.minimum,
-        "normalized_return": asdict(metrics.bootstrap([normalized])),
+        "normalized_return": asdict(statistics.bootstrap([normalized])),
         "n_failed": int(np.sum(~successes)),
     }
     ui.say(f"writing {path}")
@@ -144,7 +147,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         algorithm_name="imperfect scripted expert",
         description=f"Kitchen task {config.task}: {config.n_episodes} episodes of 100 steps by a scripted expert with "
         + (", ".join(f"{name} {value}" for name in FLAWS if (value := getattr(behaviour, name))) or "no flaws")
-        + " (drawn per episode, see zest_rl.collect.Behaviour).",
+        + " (drawn per episode, see zest_rl.kitchen.collect.Behaviour).",
         zest={"collect": {"asked": asked, "result": result, "provenance": artifacts.provenance()}},
     )
     shutil.rmtree(collect.behaviour_folder(behaviour), ignore_errors=True)
@@ -153,7 +156,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
 def _is_same(asked: Mapping[str, Any], made_by: Mapping[str, Any]) -> bool:
     """Whether a dataset is what is asked for; a number that calibration found is as good as the same number given."""
-    from zest_rl.collect import TOLERANCE
+    from zest_rl.kitchen.collect import TOLERANCE
 
     if not made_by:
         return False

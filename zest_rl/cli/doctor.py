@@ -99,8 +99,8 @@ def check_packages() -> Iterator[Check]:
 
 def check_disk() -> Iterator[Check]:
     """Look at the disks that hold the cache and the datasets: can they be written to, and how much is free."""
-    from zest_rl.artifacts import cache_dir
-    from zest_rl.data import datasets_root
+    from zest_rl.data.reader import datasets_root
+    from zest_rl.runtime.artifacts import cache_dir
 
     for name, folder, variable in (
         ("cache", cache_dir(), "ZEST_CACHE"),
@@ -126,7 +126,7 @@ def check_folder(name: str, folder: Path, variable: str) -> Check:
 
 def check_rendering() -> Iterator[Check]:
     """Render a frame of the kitchen, in a process of its own: a broken GL driver takes its process along."""
-    code = "from zest_rl.rendering import gl_backend; print(gl_backend())"
+    code = "from zest_rl.simulation.rendering import gl_backend; print(gl_backend())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     if done.returncode == 0:
         yield Check("rendering", "ok", f"MuJoCo draws by {done.stdout.strip()}")
@@ -139,8 +139,8 @@ def check_weights() -> Iterator[Check]:
     """Compare the installed weights with the sha256 that they were published with, then embed a frame."""
     import numpy as np
 
-    from zest_rl.artifacts import hash_file
     from zest_rl.embedders import DEFAULT_EMBEDDER, load_embedder
+    from zest_rl.runtime.artifacts import hash_file
 
     weights = next(file for file in importlib.metadata.files(WEIGHTS) or [] if file.suffix == ".pth")
     found = hash_file(Path(str(weights.locate())))

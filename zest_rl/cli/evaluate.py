@@ -12,7 +12,7 @@ import tyro
 from zest_rl.cli.ui import Ui
 
 if TYPE_CHECKING:
-    from zest_rl.evaluation import EvaluationConfig
+    from zest_rl.evaluation.evaluate import EvaluationConfig
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Roll out, summarise, write videos."""
     import time
 
-    from zest_rl.evaluation import evaluate, evaluation_folder
-    from zest_rl.videos import Video, ensure_videos, representative
+    from zest_rl.evaluation.evaluate import evaluate, evaluation_folder
+    from zest_rl.simulation.videos import Video, ensure_videos, representative
 
     started = time.monotonic()
     what = settings(config)
@@ -85,6 +85,6 @@ def settings(config: Config) -> EvaluationConfig:
     Raises:
         BadInput: a value is out of range.
     """
-    from zest_rl.evaluation import EvaluationConfig
+    from zest_rl.evaluation.evaluate import EvaluationConfig
 
     return EvaluationConfig(config.n_episodes, config.seed, config.rtg, config.target_quantile)

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from zest_rl.cli.recipes import expand_variables
+from zest_rl.cli.config import expand_variables
 from zest_rl.cli.ui import Ui
-from zest_rl.scores import Features, Similarity, check_names
+from zest_rl.rewards.scores import Features, Similarity, check_names
 
 if TYPE_CHECKING:
-    from zest_rl.multistep import Followed
+    from zest_rl.kitchen.task_sequence import Followed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,9 +79,9 @@ CONFIGS: dict[str, type[Any]] = {config.what: config for config in (KitchenArgum
 
 def run(config: KitchenArguments | VideoArguments, ui: Ui) -> dict[str, Any]:
     """Score the episode by each sub-goal and write the page."""
-    from zest_rl import artifacts
-    from zest_rl.multistep import follow_report, rise_in_order
+    from zest_rl.kitchen.task_sequence import follow_report, rise_in_order
     from zest_rl.report import write_report
+    from zest_rl.runtime import artifacts
 
     followed = _kitchen(config, ui) if isinstance(config, KitchenArguments) else _video(config)
     in_order = rise_in_order(followed)
@@ -111,10 +111,10 @@ def run(config: KitchenArguments | VideoArguments, ui: Ui) -> dict[str, Any]:
 
 
 def _kitchen(config: KitchenArguments, ui: Ui) -> list[Followed]:
-    from zest_rl.frames import Views
-    from zest_rl.multistep import follow_performance, perform
-    from zest_rl.scorer import Scorer, ScorerConfig
-    from zest_rl.tasks import get_task
+    from zest_rl.kitchen.task_sequence import follow_performance, perform
+    from zest_rl.kitchen.tasks import get_task
+    from zest_rl.rewards.scorer import Scorer, ScorerConfig
+    from zest_rl.simulation.views import Views
 
     for task in config.tasks:
         get_task(task)
@@ -131,8 +131,8 @@ def _kitchen(config: KitchenArguments, ui: Ui) -> list[Followed]:
 
 def _video(config: VideoArguments) -> list[Followed]:
     from zest_rl.embedders import load_embedder
-    from zest_rl.goals import TEXT
-    from zest_rl.multistep import follow_clip
+    from zest_rl.kitchen.task_sequence import follow_clip
+    from zest_rl.rewards.goals import TEXT
 
     embedder = load_embedder(config.embedder, device=config.device, precision=config.precision)
     goals = [goal if goal.startswith(TEXT) else str(expand_variables(Path(goal))) for goal in config.goals]

@@ -30,9 +30,9 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Measure, warn, write the page."""
     import numpy as np
 
+    from zest_rl.analysis.cross_task import confusion, confusion_warnings, inspection_report, labels, look_at
+    from zest_rl.analysis.inspection import inspect
     from zest_rl.errors import BadInput, ZestError
-    from zest_rl.inspection import inspect
-    from zest_rl.inspection_page import confusion, confusion_warnings, inspection_report, labels, look_at
     from zest_rl.report import write_report
 
     if not config.datasets:

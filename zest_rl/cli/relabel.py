@@ -9,7 +9,7 @@ import tyro
 
 from zest_rl.cli.ui import Ui, progress_in_parts
 from zest_rl.errors import BadInput
-from zest_rl.scores import Features, Similarity, check_goal_share, check_names
+from zest_rl.rewards.scores import Features, Similarity, check_goal_share, check_names
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
     import numpy as np
 
-    from zest_rl import data
+    from zest_rl.data import reader
     from zest_rl.sources import is_kitchen
 
     started = time.monotonic()
@@ -77,7 +77,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     result = (_from_states if frames_are_rendered else _from_frames)(config, ui)
     if result.pop("already_there"):
         ui.say(f"{result['dataset']} is there already, nothing to do")
-    returns = np.array([rewards.sum() for rewards in data.read_rewards(result["dataset"])])
+    returns = np.array([rewards.sum() for rewards in reader.read_rewards(result["dataset"])])
     if np.ptp(returns) == 0:
         ui.warn("all episodes have the same return: this goal and embedder tell nothing apart")
     return {
@@ -93,10 +93,10 @@ def _next(dataset_id: str) -> str:
     """Name a command that works on what a dataset observes and how it acts."""
     import numpy as np
 
-    from zest_rl import data
-    from zest_rl.observations import acts_discretely, entries, is_numbers
+    from zest_rl.data import reader
+    from zest_rl.data.observations import acts_discretely, entries, is_numbers
 
-    with data.open_episodes(dataset_id) as (file, names):
+    with reader.open_episodes(dataset_id) as (file, names):
         if not any(map(is_numbers, entries(file[names[0]]["observations"]).values())):
             return f"zest inspect {dataset_id}"
         trains = all(not acts_discretely(file[name]) and np.abs(file[name]["actions"][()]).max() <= 1 for name in names)
@@ -105,13 +105,13 @@ def _next(dataset_id: str) -> str:
 
 def _from_states(config: Config, ui: Ui) -> dict[str, Any]:
     """Relabel a dataset of the kitchen."""
-    from zest_rl import data
-    from zest_rl.frames import Views
-    from zest_rl.relabel import relabel
-    from zest_rl.scorer import ScorerConfig
+    from zest_rl.data import reader
+    from zest_rl.rewards.relabel import relabel
+    from zest_rl.rewards.scorer import ScorerConfig
+    from zest_rl.simulation.views import Views
 
     views = Views(
-        task=data.task_name(config.dataset),
+        task=reader.task_name(config.dataset),
         n_views=config.views,
         robot=config.show_robot,
         tolerance=config.tolerance,
@@ -148,8 +148,8 @@ def _from_states(config: Config, ui: Ui) -> dict[str, Any]:
 
 def _from_frames(config: Config, ui: Ui) -> dict[str, Any]:
     """Relabel a dataset of another robot, or the kitchen's by other frames."""
-    from zest_rl.frame_scorer import FrameScorerConfig
-    from zest_rl.relabel_frames import relabel_frames
+    from zest_rl.rewards.frame_embeddings import FrameScorerConfig
+    from zest_rl.rewards.relabel_frames import relabel_frames
     from zest_rl.sources import open_source
 
     own = [name for name in ("views", "show_robot", "tolerance") if getattr(config, name) != getattr(Config, name)]

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar
 import tyro
 
 from zest_rl.cli.ui import SilentUi, Ui
-from zest_rl.distributed import launched
+from zest_rl.training.distributed import launched
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +55,7 @@ def _with_arguments(agent: str, config: type[Any]) -> type[Any]:
 def run(config: Arguments, ui: Ui) -> dict[str, Any]:
     """Train, or go on training; of several processes under ``torchrun`` the first one tells."""
     from zest_rl.agents import AGENTS
-    from zest_rl.evaluation import is_evaluable
+    from zest_rl.evaluation.evaluate import is_evaluable
 
     first = launched().leads
     agent_class = AGENTS[config.agent].config
@@ -78,10 +78,11 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
 
 def train_on_dataset(config: Arguments, agent_config: Any, run_dir: Path, ui: Ui) -> dict[str, Any]:
     """Train `agent_config` on a dataset and leave its scorer, if it has one, in the run folder; return the meta."""
-    from zest_rl import artifacts, data
-    from zest_rl.checkpoints import snapshots
-    from zest_rl.relabel import SCORER_FILE
-    from zest_rl.training import train
+    from zest_rl.data import reader
+    from zest_rl.rewards.relabel import SCORER_FILE
+    from zest_rl.runtime import artifacts
+    from zest_rl.training.checkpoints import snapshots
+    from zest_rl.training.loop import train
 
     ui.say(f"training in {run_dir}")
     with ui.progress(f"{config.agent} updates", config.n_updates) as advance:
@@ -95,11 +96,11 @@ def train_on_dataset(config: Arguments, agent_config: Any, run_dir: Path, ui: Ui
         train(
             config.agent,
             agent_config,
-            data.read_episodes(config.dataset),
+            reader.read_episodes(config.dataset),
             run_dir,
             n_updates=config.n_updates,
             seed=config.seed,
-            meta={"dataset": data.describe(config.dataset)},
+            meta={"dataset": reader.describe(config.dataset)},
             device=config.device,
             threads=config.threads,
             checkpoint_every=config.checkpoint_every,
@@ -107,7 +108,7 @@ def train_on_dataset(config: Arguments, agent_config: Any, run_dir: Path, ui: Ui
             snapshot_every=config.snapshot_every,
             on_progress=on_progress,
         )
-    scorer = data.dataset_path(config.dataset) / SCORER_FILE
+    scorer = reader.dataset_path(config.dataset) / SCORER_FILE
     if scorer.exists() and launched().leads:
         for folder in (run_dir, *snapshots(run_dir)):
             artifacts.write_bytes(folder / SCORER_FILE, scorer.read_bytes())

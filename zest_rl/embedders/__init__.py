@@ -31,9 +31,9 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 
 import numpy as np
 
-from zest_rl.artifacts import hash_arrays, hash_file, hash_json
 from zest_rl.embedders.checkpoints import DEFAULT_EMBEDDER, LITE0_PREPROCESSING, installed_weights
 from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.runtime.artifacts import hash_arrays, hash_file, hash_json
 from zest_rl.types import FloatArray, Frame
 
 if TYPE_CHECKING:

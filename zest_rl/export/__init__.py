@@ -23,7 +23,6 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from zest_rl import artifacts
 from zest_rl.errors import BadInput, nearest
 from zest_rl.export import d3rlpy, flat, lerobot, robomimic, torchrl
 from zest_rl.export.d3rlpy import to_d3rlpy
@@ -38,6 +37,7 @@ from zest_rl.export.transitions import (
     read_scores,
     transitions,
 )
+from zest_rl.runtime import artifacts
 
 __all__ = [
     "AS_RECORDED", "Exported", "Format", "Rewards", "Shape", "Transitions", "export", "to_d3rlpy", "to_torchrl",

@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl import artifacts
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.export.transitions import Contents, Transitions, check_continuous
-from zest_rl.tasks import TASKS
+from zest_rl.kitchen.tasks import TASKS
+from zest_rl.runtime import artifacts
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from zest_rl import artifacts
 from zest_rl.export.transitions import AS_RECORDED, Contents, Rewards, read
+from zest_rl.runtime import artifacts
 
 if TYPE_CHECKING:
     from tensordict import TensorDict

@@ -14,9 +14,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl import data
+from zest_rl.data import reader as data
+from zest_rl.data.observations import acts_discretely, entries, is_numbers
 from zest_rl.errors import BadInput, nearest
-from zest_rl.observations import acts_discretely, entries, is_numbers
 from zest_rl.types import FloatArray
 
 Shape = Literal["step", "difference", "terminal"]
@@ -79,8 +79,8 @@ def transitions(dataset_id: str, rewards: Rewards = AS_RECORDED) -> list[Transit
         (T,) bool; and where they are recorded, zest_score, gt_reward (T,) float32 after the action,
         gt_episode_success (T,) bool, of the whole episode, and source_reward (T,) float32 and success (T,) bool after
         the action, which another robot's dataset came with. A Dict of observations is flattened
-        (`zest_rl.observations.numbers`), and so are actions of several dimensions; whole numbers among the actions are
-        int64, (T,) those of a Discrete space.
+        (`zest_rl.data.observations.numbers`), and so are actions of several dimensions; whole numbers among the actions
+        are int64, (T,) those of a Discrete space.
 
     Raises:
         BadInput: no such dataset, the rewards cannot be normalised, or are differences already.

@@ -3,7 +3,7 @@
 `data` holds what a report says, `charts` draws it as SVG, `page` puts both into `template.html`.
 """
 
-from zest_rl.report.data import (
+from zest_rl.report.content import (
     Curve,
     EpisodePanel,
     GoalPanel,
@@ -16,7 +16,7 @@ from zest_rl.report.data import (
     Section,
     Strip,
 )
-from zest_rl.report.page import render_html, write_report
+from zest_rl.report.html import render_html, write_report
 
 __all__ = [
     "Curve", "EpisodePanel", "GoalPanel", "Matrix", "MethodRow", "QualityRow", "QualityTable", "Report", "Scatter",

@@ -14,7 +14,7 @@ from html import escape
 
 import numpy as np
 
-from zest_rl.report.data import MethodRow, Scatter
+from zest_rl.report.content import MethodRow, Scatter
 from zest_rl.types import FloatArray
 
 MISSING = "–"

@@ -14,29 +14,29 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from zest_rl import data
-from zest_rl.data_writer import Copied, Trajectories
+from zest_rl.data import reader
+from zest_rl.data.observations import choose_pictures
+from zest_rl.data.writer import Copied, Trajectories
 from zest_rl.errors import BadInput
-from zest_rl.observations import choose_pictures
 from zest_rl.sources.base import Frames, Source
-from zest_rl.sources.clips import find_clips
 from zest_rl.sources.pictures import Pictures, picture_entries
+from zest_rl.sources.videos import find_clips
 
 __all__ = ["Frames", "Source", "is_kitchen", "open_source"]
 
 
 def is_kitchen(dataset: str) -> bool:
-    """Whether a dataset is of zest/Kitchen-v1, whose frames `zest_rl.relabel` renders."""
-    return not _is_path(dataset) and data.kitchen_task(dataset) is not None
+    """Whether a dataset is of zest/Kitchen-v1, whose frames `zest_rl.rewards.relabel` renders."""
+    return not _is_path(dataset) and reader.kitchen_task(dataset) is not None
 
 
 def _is_path(dataset: str) -> bool:
-    path, is_id = Path(dataset).expanduser(), data.DATASET_ID.fullmatch(dataset)
+    path, is_id = Path(dataset).expanduser(), reader.DATASET_ID.fullmatch(dataset)
     if not (path.exists() or is_id) and (path.suffix or dataset.startswith(("/", ".", "~"))):
         raise BadInput(
             f"there is no file or folder {dataset}; give a robomimic HDF5 file, a LeRobot folder or a Minari id"
         )
-    return path.exists() and not (is_id and data.exists(dataset))
+    return path.exists() and not (is_id and reader.exists(dataset))
 
 
 def open_source(dataset: str, *, frames: Sequence[str] = (), cameras: Sequence[str] = ()) -> Source:
@@ -86,13 +86,13 @@ def _open_path(path: Path, keys: Sequence[str], *, with_frames: bool) -> tuple[T
 
 
 def _minari_frames(dataset: str, keys: Sequence[str], cameras: Sequence[str]) -> Frames:
-    names = data.episode_names(dataset)
-    file = data.dataset_path(dataset) / data.DATA_FILE
+    names = reader.episode_names(dataset)
+    file = reader.dataset_path(dataset) / reader.DATA_FILE
     found = picture_entries(file, f"{names[0]}/observations")
     if cameras or not (keys or any(found.values())):
         from zest_rl.sources.states import find_states
 
-        env_spec = data.read_metadata(dataset).get("env_spec")
+        env_spec = reader.read_metadata(dataset).get("env_spec")
         return find_states(file, names, env_spec, cameras, f"dataset {dataset}")
     chosen = choose_pictures(found, keys, f"dataset {dataset}", "observations")
     views = tuple("/".join(part for part in ("observations", key) if part) for key in chosen)

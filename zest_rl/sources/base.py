@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from zest_rl.data_writer import Trajectories
+from zest_rl.data.writer import Trajectories
 from zest_rl.types import Frame
 
 

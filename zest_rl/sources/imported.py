@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl import artifacts
-from zest_rl.data import METADATA_FILE, SOURCE_SUCCESS
+from zest_rl.data.reader import METADATA_FILE, SOURCE_SUCCESS
 from zest_rl.errors import BadInput
+from zest_rl.runtime import artifacts
 from zest_rl.types import FloatArray
 
 
@@ -82,7 +82,7 @@ def stored(episode: Imported) -> dict[str, NDArray[Any]]:
 def fill(
     folder: Path, dataset_id: str, episodes: Iterable[Imported], description: str, *, fps: float | None = None
 ) -> None:
-    """Write the files of a Minari dataset, see `zest_rl.data_writer.Trajectories`; `fps` are steps per second."""
+    """Write the files of a Minari dataset, see `zest_rl.data.writer.Trajectories`; `fps` are steps per second."""
     import minari
     from gymnasium import spaces
     from minari.data_collector import EpisodeBuffer

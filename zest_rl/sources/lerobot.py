@@ -26,9 +26,9 @@ import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl import artifacts
+from zest_rl.data.observations import choose_pictures
 from zest_rl.errors import BadInput
-from zest_rl.observations import choose_pictures
+from zest_rl.runtime import artifacts
 from zest_rl.sources import imported
 from zest_rl.sources.imported import Imported
 from zest_rl.types import FloatArray, Frame

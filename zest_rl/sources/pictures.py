@@ -9,8 +9,8 @@ from typing import Any
 
 import h5py
 
-from zest_rl import artifacts
-from zest_rl.observations import ROWS, entries, n_channels, read_pictures, stored_rows
+from zest_rl.data.observations import ROWS, entries, n_channels, read_pictures, stored_rows
+from zest_rl.runtime import artifacts
 from zest_rl.types import Frame
 
 

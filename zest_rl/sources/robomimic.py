@@ -16,8 +16,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.data.observations import choose_pictures, entries, is_numbers
 from zest_rl.errors import BadInput
-from zest_rl.observations import choose_pictures, entries, is_numbers
 from zest_rl.sources import imported
 from zest_rl.sources.imported import Imported
 from zest_rl.sources.pictures import Pictures, picture_entries

@@ -1,9 +1,9 @@
 """Recorded simulator states of a Gymnasium environment → frames, rendered from the environment's own model.
 
-A frame is drawn as `zest_rl.rendering` draws the kitchen: no shadows, reflections, multisampling or sky. It shows the
+A frame is drawn as the kitchen's are: no shadows, reflections, multisampling or sky. It shows the
 state exactly where all that moves is in qpos, or is known to `SCENERY`: targets and furniture that an environment puts
 elsewhere in each episode. Only registered environments of the allow-listed packages are made, without their wrappers
-(`zest_rl.data.check_env_spec`, `zest_rl.envs.check_registered`).
+(`zest_rl.data.reader.check_env_spec`, `zest_rl.kitchen.env.check_registered`).
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-import zest_rl.load_order  # noqa: F401  # isort: skip
+import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
 import gymnasium
 import h5py
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl import artifacts
-from zest_rl.data import check_env_spec
-from zest_rl.envs import check_registered
+from zest_rl.data.observations import entries
+from zest_rl.data.reader import check_env_spec
 from zest_rl.errors import BadInput, ZestError, nearest
-from zest_rl.observations import entries
-from zest_rl.rendering import Canvas
-from zest_rl.sources import own_states
+from zest_rl.kitchen.env import check_registered
+from zest_rl.runtime import artifacts
+from zest_rl.simulation.rendering import Canvas
+from zest_rl.sources import rebuilt_states
 from zest_rl.types import Frame
 
 SIZE = 224
@@ -133,13 +133,13 @@ class States:
             n_rows = len(group["actions"]) + 1
             found = {path.rpartition("/")[2]: _rows(group, path, n_rows) for path in self.scenery}
             if not self.qpos:
-                return {**found, "qpos": own_states.rebuild(self._own, group, n_rows)}
+                return {**found, "qpos": rebuilt_states.rebuild(self._own, group, n_rows)}
             columns = [_rows(group, path, n_rows)[:, first:end] for path, first, end in self.qpos]
             return {**found, "qpos": np.concatenate(columns, axis=1)}
 
     @property
     def _own(self) -> EntryPoint:
-        entry = own_states.registered(json.loads(self.env_spec)["id"])
+        entry = rebuilt_states.registered(json.loads(self.env_spec)["id"])
         if entry is None:
             raise ZestError("the package that rebuilds the states is not installed on this machine; install it")
         return entry
@@ -179,7 +179,7 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
             "states could be rendered; give --frames FOLDER with a video of each episode"
         )
     spec = json.loads(env_spec)
-    own = own_states.registered(str(spec.get("id")))
+    own = rebuilt_states.registered(str(spec.get("id")))
     if own is None:
         check_env_spec(env_spec, f"the env_spec of {what}", "give --frames FOLDER with a video of each episode")
     entry_point, kwargs = str(spec["entry_point"]), spec.get("kwargs") or {}
@@ -303,9 +303,9 @@ def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
         spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
     except (ValueError, KeyError, TypeError) as error:
         raise BadInput(f"the dataset's env_spec is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
-    own = own_states.registered(spec.id)
+    own = rebuilt_states.registered(spec.id)
     if own is not None and spec.id not in gymnasium.registry:
-        own_states.load(own)  # its module registers the environment
+        rebuilt_states.load(own)  # its module registers the environment
     check_registered(spec)
     spec.additional_wrappers = ()  # what they change is not shown, and they are code
     try:

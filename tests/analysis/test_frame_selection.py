@@ -1,0 +1,140 @@
+"""Goal and action selection on frames of a real dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.conftest import COLLECTED
+from zest_rl.analysis.frame_selection import Candidates, draw_candidates, score_as_actions, score_as_goals
+from zest_rl.data import reader
+from zest_rl.errors import BadInput
+from zest_rl.kitchen.tasks import TASKS
+from zest_rl.rewards.scorer import Scorer, ScorerConfig
+from zest_rl.simulation.views import Views
+
+CONFIG = ScorerConfig(Views("micro", n_views=1, size=96, tolerance=0.05), "same-scene")
+MICRO = TASKS["micro"]
+
+
+@pytest.fixture
+def candidates(collected: str) -> Candidates:
+    """Forty frames of the tiny dataset."""
+    return draw_candidates([collected], 40)
+
+
+def test_frames_are_drawn_with_their_trajectory_its_start_and_its_task(candidates: Candidates) -> None:
+    episodes = reader.read_states(COLLECTED)
+    assert len(candidates.states) == len(candidates.trajectory) == 40
+    assert candidates.task == ("micro",) * len(episodes)
+    for state, trajectory in zip(candidates.states, candidates.trajectory, strict=True):
+        assert (episodes[trajectory][1:] == state).all(axis=1).any()
+    np.testing.assert_array_equal(candidates.starts, [episode[0] for episode in episodes])
+    again = draw_candidates([COLLECTED], 40)
+    np.testing.assert_array_equal(again.states, candidates.states)
+    assert not np.array_equal(draw_candidates([COLLECTED], 40, seed=1).states, candidates.states)
+    assert len(draw_candidates([COLLECTED], 10**6).states) == sum(len(episode) - 1 for episode in episodes)
+
+
+def test_satisfied_goals_are_those_of_the_recorded_ground_truth(collected: str) -> None:
+    every = draw_candidates([collected], 10**6)
+    truth = np.concatenate([episode.rewards for episode in reader.read_ground_truth(collected)])
+    np.testing.assert_array_equal(every.satisfies(MICRO), truth >= 0.999)
+    assert every.satisfies(MICRO).any()
+    assert not every.satisfies(TASKS["sdoor"]).any(), "nobody touched the sliding door"
+    np.testing.assert_array_equal(every.does(TASKS["sdoor"]), every.satisfies(MICRO))  # opening is opening
+    assert not every.does(TASKS["knob2"]).any(), "turning on is something else"
+
+
+def test_the_context_is_of_the_same_or_always_of_another_trajectory(candidates: Candidates) -> None:
+    same = candidates.contexts("same", 0)
+    np.testing.assert_array_equal(same, candidates.starts[candidates.trajectory])
+    for seed in range(5):
+        other = candidates.contexts("different", seed)
+        assert (other != same).any(axis=1).all()
+        assert all((candidates.starts == row).all(axis=1).any() for row in other)
+    with pytest.raises(BadInput, match="unknown context 'none'"):
+        candidates.contexts("none", 0)  # type: ignore[arg-type]
+    alone = replace(candidates, starts=candidates.starts[:1], trajectory=np.zeros_like(candidates.trajectory))
+    with pytest.raises(BadInput, match="needs at least 2 trajectories"):
+        alone.contexts("different", 0)
+
+
+def test_scores_are_the_scorer_s_and_find_the_open_door(candidates: Candidates) -> None:
+    scores = score_as_goals(candidates, CONFIG, n_workers=1)
+    scorer = Scorer.build(CONFIG, candidates.starts[0], n_workers=1)
+    expected = [
+        scorer.score_episodes([np.stack([candidates.starts[i], state])])[0][0][-1]
+        for i, state in zip(candidates.trajectory, candidates.states, strict=True)
+    ]
+    np.testing.assert_allclose(scores, [expected], atol=1e-6)
+    reached = candidates.satisfies(MICRO)
+    assert scores[0, reached].mean() > scores[0, ~reached].mean()
+
+
+def test_repeats_draw_other_goals(candidates: Candidates) -> None:
+    config = replace(CONFIG, goal="drawings")
+    rows = score_as_goals(candidates, config, n_repeats=3, n_goals=1, n_workers=1)
+    assert rows.shape == (3, 40)
+    assert len({row.tobytes() for row in rows}) > 1
+    with pytest.raises(BadInput, match=r"pictures, 99 cannot be drawn of them"):
+        score_as_goals(candidates, config, n_goals=99, n_workers=1)
+
+
+def test_an_action_is_seen_from_the_views_of_the_trajectory_s_own_task(candidates: Candidates) -> None:
+    of_another_goal = replace(CONFIG, views=replace(CONFIG.views, task="sdoor"))
+    scores = score_as_actions(candidates, of_another_goal, n_workers=1)
+    goal = Scorer.build(of_another_goal, candidates.starts[0], n_workers=1)
+    seen = Scorer(CONFIG, goal.starts, goal.goals, "", n_workers=1)
+    expected = seen.score_pairs(candidates.contexts("same", 0), candidates.states)
+    np.testing.assert_allclose(scores, [expected], atol=1e-6)
+    assert np.ptp(scores) > 0
+
+
+def test_the_verbs_tell_how_much_better_than_chance_a_goal_is(
+    collected: str, zest: Callable[..., dict[str, Any]]
+) -> None:
+    small = ("--views", 1, "--tolerance", 0.05, "--n-frames", 60, "--top", 5, "--n-workers", 1)
+    goals = zest("select", "goals", collected, *small)
+    assert (goals["task"], goals["n_candidates"], goals["top"]) == ("micro", 60, 5)
+    assert goals["goal_frame_ratio"] == goals["n_satisfying"] / 60
+    assert goals["top_n_success"]["ci95"][0] <= goals["top_n_success"]["value"] <= goals["top_n_success"]["ci95"][1]
+    assert goals["times_random"] == pytest.approx(goals["top_n_success"]["value"] / goals["goal_frame_ratio"])
+    actions = zest("select", "actions", collected, "--task", "ldoor", *small)
+    assert (actions["select"], actions["n_satisfying"]) == ("actions", goals["n_satisfying"])
+
+
+def test_x_0_of_another_trajectory_matters_where_starts_differ(
+    candidates: Candidates, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from zest_rl import cli
+
+    assert candidates.start_alike(CONFIG.views), "the robot is hidden"
+    assert not candidates.start_alike(replace(CONFIG.views, robot=True, tolerance=1e-3))
+    ajar = candidates.starts.copy()
+    ajar[1:, 22] = [-0.1, -0.2, -0.3]  # the microwave
+    for starts, equal in ((candidates.starts, True), (ajar, False)):
+        pool = replace(candidates, starts=starts)
+        same, other = (score_as_goals(pool, CONFIG, context=c, n_workers=1) for c in ("same", "different"))
+        assert np.allclose(same, other) == equal
+    words = ("--views", "1", "--tolerance", "0.05", "--n-frames", "60", "--top", "5", "--n-workers", "1")
+    assert cli.main(["select", "goals", COLLECTED, "--context", "different", "--n-repeats", "1", *words]) == 0
+    assert "x_0 of another one changes nothing; try --show-robot" in capsys.readouterr().err
+
+
+def test_what_cannot_be_selected_from_is_refused(collected: str, capsys: pytest.CaptureFixture[str]) -> None:
+    from zest_rl import cli
+
+    assert cli.main(["select", "goals", collected, "--task", "sdoor", "--n-frames", "20"]) == 2
+    assert "only 0 of 20 candidates satisfy the goal of 'sdoor'" in capsys.readouterr().err
+    with pytest.raises(BadInput, match="at least 1 dataset, each once, and 1 frame of each, got none and 5"):
+        draw_candidates([], 5)
+    with pytest.raises(BadInput, match="each once"):
+        draw_candidates([collected, collected], 5)
+    for wrong in ("--top", "--n-repeats", "--n-frames", "--views"):
+        assert cli.main(["select", "goals", collected, wrong, "0"]) == 2
+        assert "must be at least 1" in capsys.readouterr().err

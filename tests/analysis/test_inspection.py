@@ -1,0 +1,265 @@
+"""What a dataset's rewards are worth: figures and warnings on real relabeled data, and on rewards that are broken."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.conftest import COLLECTED, collect_some
+from zest_rl.analysis.cross_task import Confusion, confusion, confusion_warnings, inspection_report, labels
+from zest_rl.analysis.inspection import FIGURES, Inspection, inspect, warnings
+from zest_rl.data import reader
+from zest_rl.errors import BadInput
+from zest_rl.metrics import reward_quality, statistics
+from zest_rl.metrics.statistics import Estimate
+from zest_rl.report import render_html
+from zest_rl.rewards.relabel import relabel
+from zest_rl.rewards.scorer import ScorerConfig
+from zest_rl.simulation import rendering
+from zest_rl.simulation.views import Views
+
+VIEWS = Views("micro", n_views=1, size=96, tolerance=0.05)
+CONFIG = ScorerConfig(VIEWS, "same-scene")
+NEEDS_TRUTH = {figure.name for figure in FIGURES if figure.needs == "truth"}
+
+
+@pytest.fixture
+def scored(collected: str) -> str:
+    """The tiny dataset with same-scene scores."""
+    return relabel(collected, CONFIG, n_workers=1).dataset_id
+
+
+def episodes_file(dataset_id: str) -> Path:
+    return reader.dataset_path(dataset_id) / "data" / "main_data.hdf5"
+
+
+def test_figures_are_those_of_the_recorded_scores_and_ground_truth(scored: str) -> None:
+    found = inspect(scored)
+    returns = np.array([score[1:].sum() for score in reader.read_scores(scored)])
+    truth = np.array([episode.episode_return for episode in reader.read_ground_truth(scored)])
+    assert set(found.figures) == {figure.name for figure in FIGURES}
+    assert found.figures["Spearman ρ"] == statistics.spearman(returns, truth)
+    assert found.figures["Pairwise accuracy"] == reward_quality.pairwise_accuracy(returns, truth)
+    assert found.figures["Contradictory"].value == 0
+    assert (found.task, found.has_truth) == ("micro", True)
+    scores, success = reader.read_scores(scored), [episode.success for episode in reader.read_ground_truth(scored)]
+    for name, wanted in (("successes", True), ("failures", False)):
+        group = [score[1:] for score, won in zip(scores, success, strict=True) if won == wanted]
+        assert (name in found.over_time) == bool(group)
+        if group:
+            np.testing.assert_allclose(found.over_time[name], np.mean(group, axis=0), rtol=1e-5)
+
+
+def test_scores_of_other_episodes_are_found_out_without_ground_truth(collected: str) -> None:
+    shuffled = relabel(collected, CONFIG, shuffle=0, n_workers=1).dataset_id
+    found = inspect(shuffled)
+    assert found.figures["Contradictory"].value > 0.01
+    told, seen = (warning for warning in found.warnings if "shuffle" in warning)
+    assert "relabeled with --shuffle" in told
+    assert "not of these episodes (shuffled?)" in seen
+
+
+def test_without_ground_truth_the_rest_is_still_measured(scored: str) -> None:
+    with h5py.File(episodes_file(scored), "r+") as file:
+        for name in file:
+            del file[name]["infos/gt"]
+    (reader.dataset_path(scored) / reader.MANIFEST_FILE).unlink()
+    found = inspect(scored)
+    assert set(found.figures) == {figure.name for figure in FIGURES} - NEEDS_TRUTH
+    assert list(found.over_time) == ["all episodes"]
+    assert not found.has_truth
+    page = render_html(inspection_report([found], None, {}, {}))
+    assert "Contradictory" in page
+    assert "Ranking" not in page
+
+
+FINE = Estimate(0.0, 0.0, 0.0)
+SCORES = [np.array([0.0, 0.5, 1.0], np.float32), np.array([0.0, 0.1, 0.2], np.float32)]
+
+
+@pytest.mark.parametrize(
+    ("figure", "value", "expected"),
+    [
+        ("Contradictory", 0.02, "2% of the frames score otherwise than an equal frame"),
+        ("Told by the step", 0.96, "the reward is a clock"),
+        ("Straight in time", 0.93, "nearly proportional to time"),
+        ("Saturated", 0.96, "most progress is not rewarded"),
+        ("Nothing to see", 0.95, "nothing moves, or the cameras do not see it"),
+    ],
+)
+def test_each_degenerate_reward_has_its_warning(figure: str, value: float, expected: str) -> None:
+    figures = dict.fromkeys((figure.name for figure in FIGURES if figure.needs != "truth"), FINE)
+    assert warnings(SCORES, figures) == []
+    (warning,) = warnings(SCORES, {**figures, figure: Estimate(value, value, value)})
+    assert expected in warning
+
+
+@pytest.mark.parametrize(
+    ("rho", "expected"),
+    [
+        (Estimate(0.2, -0.1, 0.5), "ρ = 0.20, 95 % interval -0.10 to 0.50."),
+        (Estimate(-0.6, -0.8, -0.4), "The higher the return, the worse the episode."),
+        (Estimate(np.nan, np.nan, np.nan), "do not rank the episodes"),
+    ],
+)
+def test_returns_that_do_not_rank_the_episodes_are_warned_of(rho: Estimate, expected: str) -> None:
+    figures = {**dict.fromkeys((figure.name for figure in FIGURES), FINE), "Spearman ρ": Estimate(0.9, 0.8, 0.95)}
+    assert warnings(SCORES, figures) == []
+    (warning,) = warnings(SCORES, {**figures, "Spearman ρ": rho})
+    assert expected in warning
+
+
+def test_constant_scores_and_constant_returns_are_warned_of() -> None:
+    figures = dict.fromkeys((figure.name for figure in FIGURES if figure.needs != "truth"), FINE)
+    assert "tell nothing apart" in warnings([np.ones(3, np.float32)] * 3, figures)[0]
+    nearly = [np.float32(0.7) + np.float32(1e-6) * score for score in SCORES]
+    assert "tell nothing apart" in warnings(nearly, figures)[0]
+    assert warnings([np.float32(1e-6) * score for score in SCORES], figures) == [], "small is not constant"
+    assert warnings([np.float32(0.999) + np.float32(8e-4) * score for score in SCORES], figures) == []
+    alike = [np.array([0.0, 1.0], np.float32), np.array([1.0, 0.0], np.float32)]
+    assert "same return" in warnings(alike, figures)[0]
+
+
+def test_differences_are_judged_as_the_trainer_sees_them(collected: str, scored: str) -> None:
+    differences = relabel(collected, CONFIG, reward="difference", n_workers=1).dataset_id
+    found, level = inspect(differences), inspect(scored)
+    last = np.array([score[-1] - score[0] for score in reader.read_scores(differences)])
+    truth = np.array([episode.episode_return for episode in reader.read_ground_truth(differences)])
+    assert found.figures["Spearman ρ"].value == pytest.approx(statistics.spearman(last, truth).value)
+    assert found.figures["Contradictory"].value == 0, "levels repeat where states do, differences need not"
+    assert found.figures["Value-order correlation"] != level.figures["Value-order correlation"]
+    assert labels([found, level]) == ["micro by same-scene, reward difference", "micro by same-scene, reward level"]
+
+
+def test_labels_tell_what_differs() -> None:
+    def made(**changes: Any) -> dict[str, Any]:
+        config = {"goal": "same-scene", "embedder": "e", "features": "delta", "similarity": "cos", "goal_share": 1.0}
+        views = {"n_views": changes.pop("n_views", 8)}
+        reward, shuffle = changes.pop("reward", "level"), changes.pop("shuffle", None)
+        return {"scorer": {"config": {**config, "views": views, **changes}}, "reward": reward, "shuffle": shuffle}
+
+    def named(*all_made: dict[str, Any]) -> list[str]:
+        return labels(
+            [Inspection(f"zest/{i}", "micro", one, {}, (), {}, np.zeros(0), None) for i, one in enumerate(all_made)]
+        )
+
+    assert named(made()) == ["micro by same-scene"]
+    assert named(made(), made(goal="/a/b/drawn")) == ["micro by same-scene", "micro by drawn"]
+    assert named(made(), made(features="raw", n_views=1)) == [
+        "micro by same-scene, features delta, views 8",
+        "micro by same-scene, features raw, views 1",
+    ]
+    assert named(made(), made(shuffle=3)) == ["micro by same-scene, shuffled no", "micro by same-scene, shuffled 3"]
+    assert named(made(), made()) == ["micro by same-scene (zest/0)", "micro by same-scene (zest/1)"]
+
+
+@pytest.fixture
+def of_two_tasks(collected: str, zest: Callable[..., dict[str, Any]]) -> tuple[str, str]:
+    """The tiny microwave dataset and one of the sliding door, each with scores of its own scene."""
+    other = "zest/kitchen-sdoor-tiny-v0"
+    collect_some(other, "sdoor", 3)
+    small = ("--views", 1, "--tolerance", 0.05, "--n-workers", 1)
+    return zest("relabel", collected, *small)["dataset"], zest("relabel", other, *small)["dataset"]
+
+
+def test_each_goal_scores_the_ends_of_all_tasks_as_their_own_views_show_them(
+    collected: str, scored: str, of_two_tasks: tuple[str, str]
+) -> None:
+    inspections = [inspect(dataset) for dataset in (*of_two_tasks, scored)]
+    done: list[None] = []
+    compared = confusion(inspections, n_workers=1, on_done=lambda: done.append(None))
+    assert len(done) == 3
+    ids = collected, "zest/kitchen-sdoor-tiny-v0"
+    assert list(compared.sources.items()) == [
+        ((ids[0], reader.fingerprint(ids[0])), "micro"),
+        ((ids[1], reader.fingerprint(ids[1])), "sdoor"),
+    ]
+    assert compared.row_names() == ("micro", "sdoor")
+    assert compared.own == (0, 1, 0), "what was relabeled twice is one row"
+    means = compared.means
+    assert means.shape == (2, 3)
+    for i, dataset in enumerate(of_two_tasks):
+        own = np.mean([score[-1] for score in reader.read_scores(dataset)])
+        assert means[i, i] == pytest.approx(own, abs=1e-5)
+        assert means[i, i] > means[1 - i, i], "an open door looks more like itself than like another one"
+        assert means[1 - i, i] != 0, "something is seen to change"
+    assert confusion_warnings(inspections, compared) == {}
+    assert (compared.low <= means).all()
+    assert (means <= compared.high).all()
+    found = confusion_warnings(inspections, replace(compared, means=means[::-1]))
+    assert set(found) == {*of_two_tasks, scored}
+    assert "the episodes of sdoor higher" in found[of_two_tasks[0]]
+
+
+def test_a_goal_that_scores_another_task_higher_is_told_though_a_sibling_scores_highest(
+    of_two_tasks: tuple[str, str],
+) -> None:
+    inspections = [inspect(dataset) for dataset in of_two_tasks]
+    a, b, c = ("zest/a-v0", "1" * 64), ("zest/b-v0", "2" * 64), ("zest/c-v0", "3" * 64)
+    means = np.array([[0.3, 0.1], [0.9, 0.1], [0.5, 0.8]], np.float32)
+    found = Confusion({a: "micro", b: "micro", c: "sdoor"}, (0, 2), means, means - 0.01, means + 0.01)
+    assert confusion_warnings(inspections, found) == {
+        of_two_tasks[0]: "Its goal scores the episodes of sdoor higher (0.50) than its own (0.30)."
+    }
+    assert found.row_names() == ("micro (zest/a-v0)", "micro (zest/b-v0)", "sdoor")
+    alike = np.full((3, 2), 0.8, np.float32)
+    told = confusion_warnings(inspections, replace(found, means=alike, low=alike - 0.01, high=alike + 0.01))
+    assert set(told) == set(of_two_tasks)
+    assert "every task alike (0.80 to 0.80)" in told[of_two_tasks[0]]
+    again = replace(found, sources={a: "micro", (a[0], b[1]): "micro", c: "sdoor"})
+    assert again.row_names() == ("micro (zest/a-v0, 11111111)", "micro (zest/a-v0, 22222222)", "sdoor")
+
+
+def test_the_page_shows_tasks_against_goals_and_does_without_where_scorers_are_of_another_version(
+    of_two_tasks: tuple[str, str],
+    tmp_path: Path,
+    zest: Callable[..., dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    words = ("inspect", *of_two_tasks, "--output", tmp_path / "page.html", "--n-workers", 1)
+    found = zest(*words)["goals_against_tasks"]
+    assert found["by_goal_of"] == list(of_two_tasks)
+    assert found["episodes_of"][1] == "zest/kitchen-sdoor-tiny-v0"
+    matrix = found["mean_scores"]
+    assert np.shape(matrix) == (2, 2)
+    page = (tmp_path / "page.html").read_text()
+    assert "<h2>Tasks against goals</h2>" in page
+    assert f"<b>{matrix[1][1]:.2f}</b>" in page
+    low, high = found["ci95"][1][1]
+    assert low <= matrix[1][1] <= high
+    monkeypatch.setattr(rendering, "_RENDERER_VERSION", -1)
+    assert zest(*words)["goals_against_tasks"] is None
+    assert "<h2>Frames</h2>" not in (tmp_path / "page.html").read_text()
+    assert "<h2>Reward quality</h2>" in (tmp_path / "page.html").read_text()
+
+
+def test_the_verb_prints_figures_warns_and_leaves_a_page(
+    collected: str, scored: str, tmp_path: Path, zest: Callable[..., dict[str, Any]]
+) -> None:
+    shuffled = relabel(collected, CONFIG, shuffle=0, n_workers=1).dataset_id
+    result = zest("inspect", scored, shuffled, "--output", tmp_path / "page.html")
+    assert set(result["datasets"]) == {scored, shuffled}
+    figure = result["datasets"][scored]["figures"]["Value-order correlation"]
+    assert figure["ci95"][0] <= figure["value"] <= figure["ci95"][1]
+    assert any("shuffled?" in warning for warning in result["warnings"][shuffled])
+    assert not any("shuffled?" in warning for warning in result["warnings"][scored])
+    assert result["goals_against_tasks"] is None, "both are of one task"
+    page = (tmp_path / "page.html").read_text()
+    assert page.count('class="strip"') == 2, "best and worst; the shuffled scores are not those of what is seen"
+    for heading in ("Warnings", "Reward quality", "Ranking", "Frames", "Views", "Pixels", "Scores over time"):
+        assert f"<h2>{heading}</h2>" in page
+    json.dumps(result, allow_nan=False)
+
+
+def test_what_cannot_be_judged_is_refused(collected: str) -> None:
+    with pytest.raises(BadInput, match="holds no ZeST scores; run `zest relabel"):
+        inspect(COLLECTED)
+    with pytest.raises(BadInput, match="there is no dataset"):
+        inspect("zest/nothing-v0")

@@ -1,0 +1,393 @@
+from __future__ import annotations
+
+import errno
+import io
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any, Literal
+
+import pytest
+import tyro
+
+from zest_rl import __version__, cli
+from zest_rl.cli.config import load_config, parse_config, read_recipe
+from zest_rl.cli.ui import SilentUi, StreamUi, Ui
+from zest_rl.errors import BadInput, ZestError
+
+
+@dataclass(frozen=True)
+class Config:
+    """Make a toy."""
+
+    dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
+    """Id of a dataset."""
+    similarity: Literal["cos", "l2"] = "cos"
+    """Which similarity."""
+    n_episodes: int = 3
+    """How many episodes."""
+    noise: float = 0.5
+    """Standard deviation, in rad."""
+    views: tuple[int, ...] = (1, 2)
+    size: tuple[int, int] = (224, 224)
+    out: Path | None = None
+    video: bool = False
+
+    def __post_init__(self) -> None:
+        if self.n_episodes < 1:
+            raise BadInput(f"n-episodes must be at least 1, got {self.n_episodes}")
+
+
+Run = Callable[[Any, Ui], dict[str, Any]]
+
+
+@pytest.fixture
+def toy(monkeypatch: pytest.MonkeyPatch) -> Callable[..., ModuleType]:
+    """Add a verb `toy` to the command."""
+
+    def add(run: Run, **contents: Any) -> ModuleType:
+        module = ModuleType("zest_rl.cli.toy")
+        module.__dict__.update({"Config": Config, "run": run} | contents)
+        monkeypatch.setitem(sys.modules, "zest_rl.cli.toy", module)
+        monkeypatch.setitem(cli.VERBS, "toy", "make a toy")
+        return module
+
+    return add
+
+
+def raises(error: BaseException) -> Run:
+    def run(config: Any, ui: Ui) -> dict[str, Any]:
+        raise error
+
+    return run
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "toy.toml"
+    path.write_text(text)
+    return path
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_help_answers_at_once_and_names_verbs_and_exit_codes() -> None:
+    start = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys; from zest_rl.cli import main; sys.exit(main())", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert time.perf_counter() - start < 2, "half a second is promised; the bound allows for a busy machine"
+    assert all(f"\n  {verb} " in done.stdout for verb in cli.VERBS)
+    assert "exit codes: 0 done, 1 failed, 2 bad input" in done.stdout
+
+
+@pytest.mark.parametrize("verb", cli.VERBS)
+def test_the_help_of_every_verb_imports_nothing_heavy(verb: str) -> None:
+    """Except torch for `train`: its sub-verbs are the agents' registry, so that a new agent needs no line here."""
+    code = (
+        "import sys; from zest_rl.cli import main; code = main([sys.argv[1], '--help']); "
+        "heavy = {'torch', 'transformers', 'mujoco', 'minari', 'timm', 'gymnasium'} & set(sys.modules); "
+        "sys.exit(code or ' '.join(heavy - set(sys.argv[2:])) or 0)"
+    )
+    allowed = ["torch"] if verb == "train" else []
+    done = subprocess.run([sys.executable, "-c", code, verb, *allowed], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert f"usage: zest {verb}" in done.stdout
+
+
+def test_every_verb_describes_itself_and_its_arguments(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["doctor", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert "say how to mend" in out
+    assert "--recipe FILE.toml" in out
+
+
+def test_the_version_is_the_package_s(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"zest {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("argv", "complaint"),
+    [
+        (["colect"], "error: unknown verb 'colect'; did you mean 'collect'"),
+        (["--json", "doctor"], "the verb comes first: zest VERB --json"),
+        (["toy"], "DATASET"),
+        (["toy", "d", "--n-epsodes", "4"], "--n-episodes"),
+        (["toy", "d", "--similarity", "dot"], "Expected one of ('cos', 'l2')"),
+        (["toy", "d", "--n-episodes", "0"], "error: n-episodes must be at least 1, got 0\n"),
+        (["toy", "d", "--recipe"], "--recipe needs a file"),
+    ],
+)
+def test_bad_input_is_one_error_on_stderr_and_exit_code_2(
+    argv: list[str], complaint: str, toy: Callable[..., ModuleType], capsys: pytest.CaptureFixture[str]
+) -> None:
+    toy(lambda config, ui: {})
+    assert cli.main(argv) == 2
+    out, err = capsys.readouterr()
+    assert err.startswith("error: ")
+    assert complaint in err
+    assert not set("│╭╰") & set(err)
+    assert "Traceback" not in err
+    assert out == "" or "--json" in argv
+
+
+def test_no_verb_at_all_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == 2
+    assert "usage: zest VERB" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (ZestError("no GL library"), 1, "error: no GL library"),
+        (BadInput("no such task"), 2, "error: no such task"),
+        (
+            OSError(errno.ENOSPC, "No space left", "/data/x"),
+            1,
+            "error: the disk is full at /data/x; free some",
+        ),
+        (PermissionError(errno.EACCES, "Permission denied", "/data/x"), 1, "error: Permission denied at /data/x"),
+        (KeyError("x"), 1, "error: unexpected KeyError: 'x'; ZEST_TRACEBACK=1 shows where"),
+        (KeyboardInterrupt(), 130, "interrupted; run the same command again to go on"),
+    ],
+)
+def test_each_kind_of_failure_has_its_exit_code_and_no_traceback(
+    error: BaseException,
+    code: int,
+    message: str,
+    toy: Callable[..., ModuleType],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("ZEST_TRACEBACK", raising=False)
+    toy(raises(error))
+    assert cli.main(["toy", "d"]) == code
+    out, err = capsys.readouterr()
+    assert err.startswith(message)
+    assert "Traceback" not in err
+    assert out == ""
+
+
+def test_a_traceback_is_shown_when_asked_for(
+    toy: Callable[..., ModuleType], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ZEST_TRACEBACK", "1")
+    toy(raises(ZestError("no GL library")))
+    assert cli.main(["toy", "d"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_with_json_a_failure_is_a_document_too(
+    toy: Callable[..., ModuleType], capsys: pytest.CaptureFixture[str]
+) -> None:
+    toy(raises(ZestError("no GL library")))
+    assert cli.main(["toy", "d", "--json"]) == 1
+    document = json.loads(capsys.readouterr().out)
+    assert document == {"error": {"type": "ZestError", "message": "no GL library", "exit_code": 1}}
+    assert cli.main(["toy", "--json", "--n-episodes", "four"]) == 2
+    assert json.loads(capsys.readouterr().out)["error"]["type"] == "BadInput"
+
+
+def test_with_json_stdout_holds_the_result_alone(
+    toy: Callable[..., ModuleType], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(config: Config, ui: Ui) -> dict[str, Any]:
+        print("a library talks")
+        ui.say("writing")
+        return {"dataset": config.dataset, "next": "zest train bc d"}
+
+    toy(run)
+    assert cli.main(["toy", "d", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out) == {"dataset": "d", "next": "zest train bc d"}
+    assert err == "a library talks\nwriting\n"
+
+
+def test_the_summary_lists_the_result_and_ends_with_the_next_command(
+    toy: Callable[..., ModuleType], capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = {
+        "ok": True, "mean": 0.123456, "seeds": [1, 2], "returns": {"demo": 10}, "cells": [{"task": "micro"}],
+        "next": "zest report",
+    }  # fmt: skip
+    toy(lambda config, ui: result)
+    assert cli.main(["toy", "d"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "mean: 0.1235", "seeds: 1, 2", "returns:", "  demo: 10", "cells 1:", "  task: micro", "next: zest report",
+    ]  # fmt: skip
+
+
+def test_a_verb_may_write_its_own_summary(toy: Callable[..., ModuleType], capsys: pytest.CaptureFixture[str]) -> None:
+    toy(lambda config, ui: {"n": 3}, summary=lambda result: f"{result['n']} toys")
+    assert cli.main(["toy", "d"]) == 0
+    assert capsys.readouterr().out == "3 toys\n"
+
+
+def test_a_result_that_is_not_ok_exits_with_1(toy: Callable[..., ModuleType]) -> None:
+    toy(lambda config, ui: {"ok": False})
+    assert cli.main(["toy", "d"]) == 1
+
+
+def test_a_verb_with_sub_verbs_gives_run_the_config_of_the_chosen_one(
+    toy: Callable[..., ModuleType], capsys: pytest.CaptureFixture[str]
+) -> None:
+    toy(lambda config, ui: {"got": type(config).__name__}, Config=None, CONFIGS={"one": Config})
+    assert cli.main(["toy", "one", "d", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"got": "Config"}
+    assert cli.main(["toy", "--help"]) == 0
+    assert "  one        Make a toy." in capsys.readouterr().out
+    assert cli.main(["toy", "onn"]) == 2
+    assert "needs a sub-verb first, got 'onn'; did you mean 'one'?" in capsys.readouterr().err
+    assert cli.main(["toy"]) == 2
+    assert "needs a sub-verb first, got nothing; valid: one" in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_with_130_and_says_how_to_go_on() -> None:
+    code = (
+        "import sys, time; from zest_rl.cli import doctor, main\n"
+        "def run(config, ui): ui.say('ready'); time.sleep(60)\n"
+        "doctor.run = run; sys.exit(main(['doctor']))"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline() == "ready\n"
+        process.send_signal(signal.SIGINT)
+        assert process.stderr.read() == "interrupted; run the same command again to go on\n"
+    assert process.returncode == 130
+
+
+# --- recipes ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_recipe_supplies_defaults_and_flags_win(tmp_path: Path) -> None:
+    recipe = write(tmp_path, 'verb = "toy"\ndataset = "d"\nn-episodes = 7\nnoise = 1\nviews = [4, 5]\nout = "o"\n')
+    config, as_json = parse_config(Config, ["--recipe", str(recipe), "--noise", "0.25"], "toy")
+    assert config == Config("d", n_episodes=7, noise=0.25, views=(4, 5), out=Path("o"))
+    assert not as_json
+    config, as_json = parse_config(Config, ["e", f"--recipe={recipe}", "--n_episodes", "8", "--json", "--video"], "toy")
+    assert (config.dataset, config.n_episodes, config.noise, config.video) == ("e", 8, 1.0, True)
+    assert as_json
+
+
+def test_help_shows_the_recipe_s_values_as_the_defaults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recipe = write(tmp_path, "n_episodes = 77")
+    with pytest.raises(SystemExit) as stop:
+        parse_config(Config, ["--recipe", str(recipe), "--help"], "toy")
+    assert stop.value.code == 0
+    assert "(default: 77)" in capsys.readouterr().out
+
+
+def test_all_problems_of_a_recipe_are_reported_at_once(tmp_path: Path) -> None:
+    recipe = write(
+        tmp_path,
+        'n_episods = 3\nsimilarity = "dot"\nnoise = "much"\n'
+        'views = [1, "two"]\nsize = [1]\nvideo = 1\nn-episodes = true',
+    )
+    with pytest.raises(BadInput) as caught:
+        parse_config(Config, ["d", "--recipe", str(recipe)], "toy")
+    for problem in (
+        "unknown key 'n_episods'; did you mean 'n-episodes'?",
+        "'similarity' must be one of 'cos', 'l2', got 'dot'",
+        "'noise' must be a number, got 'much'",
+        "'views' must be a list of an integer, got [1, 'two']",
+        "'size' must be a list [an integer, an integer], got [1]",
+        "'video' must be true or false, got 1",
+        "'n-episodes' must be an integer, got True",
+    ):
+        assert problem in str(caught.value)
+
+
+def test_a_key_given_in_both_spellings_is_refused() -> None:
+    with pytest.raises(BadInput, match="given twice"):
+        load_config(Config, {"dataset": "d", "n-episodes": 1, "n_episodes": 2}, "table 1")
+
+
+def test_a_recipe_for_another_verb_is_refused(tmp_path: Path) -> None:
+    recipe = write(tmp_path, 'verb = "train dt"')
+    with pytest.raises(BadInput, match="is for `zest train dt`, not for `zest train bc`"):
+        parse_config(Config, ["--recipe", str(recipe)], "train bc")
+
+
+def test_a_recipe_that_is_missing_or_no_toml_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, "n_episodes = = 3")
+    with pytest.raises(BadInput, match=r"there is no recipe .*tiy\.toml; did you mean 'toy\.toml'"):
+        read_recipe(tmp_path / "tiy.toml")
+    with pytest.raises(BadInput, match=r"toy\.toml is not TOML: .*line 1"):
+        read_recipe(tmp_path / "toy.toml")
+
+
+def test_a_config_can_be_built_from_a_table_alone() -> None:
+    table = {"dataset": "d", "n-episodes": 2, "size": [64, 32]}
+    assert load_config(Config, table, "cell micro") == Config("d", n_episodes=2, size=(64, 32))
+    with pytest.raises(BadInput, match=r"^cell micro: unknown key 'nois'(.|\n)*'dataset' is required$"):
+        load_config(Config, {"nois": 1.0}, "cell micro")
+    with pytest.raises(BadInput, match="cell micro: n-episodes must be at least 1"):
+        load_config(Config, {"dataset": "d", "n_episodes": 0}, "cell micro")
+
+
+# --- progress ---------------------------------------------------------------------------------------------------------
+
+
+class Terminal(io.StringIO):
+    """A stream that says it is a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_without_a_terminal_progress_is_a_line_every_ten_seconds_and_one_at_the_end() -> None:
+    stream, now = io.StringIO(), 0.0
+    with StreamUi(stream, clock=lambda: now).progress("collecting", 30) as advance:
+        for _ in range(30):
+            now += 1.0
+            advance(loss=0.123456)
+    assert stream.getvalue().splitlines() == [
+        "collecting: 10/30 (33%), 10 s, about 20 s left, loss 0.1235",
+        "collecting: 20/30 (67%), 20 s, about 10 s left, loss 0.1235",
+        "collecting: 30/30 (100%), 30 s, loss 0.1235",
+    ]
+
+
+def test_on_a_terminal_progress_is_a_bar_and_may_be_nested(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    stream = Terminal()
+    ui = StreamUi(stream)
+    with ui.progress("cells", 2) as outer:
+        with ui.progress("steps [1]", 5) as inner:
+            inner(5, loss=0.5)
+            ui.warn("[b] is odd")
+        outer(2)
+    ui.say("done")
+    text = stream.getvalue()
+    assert "━" in text
+    assert "steps [1]" in text
+    assert "2/2" in text
+    assert "warning: [b] is odd" in text
+    assert text.endswith("done\n")
+
+
+def test_a_bar_is_taken_down_when_the_work_fails() -> None:
+    ui = StreamUi(Terminal())
+    with pytest.raises(ZestError), ui.progress("cells", 2):
+        raise ZestError("broken")
+    with ui.progress("cells", 1) as advance:
+        advance()
+
+
+def test_the_silent_ui_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    ui: Ui = SilentUi()
+    ui.say("a")
+    ui.warn("b")
+    with ui.progress("c", 1) as advance:
+        advance(1, loss=2.0)
+    assert capsys.readouterr() == ("", "")

@@ -1,0 +1,437 @@
+"""`zest reproduce`, which joins all verbs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from zest_rl import cli
+from zest_rl.cli import reproduce
+from zest_rl.cli.reproduce.plan import TaskData, plan_cells, read_plan
+from zest_rl.data import reader
+from zest_rl.kitchen import collect
+from zest_rl.report import comparison
+from zest_rl.runtime import artifacts
+
+RECIPE = """
+title = "A tiny comparison"
+seeds = [0]
+caveats = ["Tiny."]
+paper_demo = 81.19
+
+[collect]
+task = "micro"
+n_episodes = 4
+noise_max = 1.0
+dataset = "zest/kitchen-micro-whole-v0"
+
+[relabel]
+views = 1
+tolerance = 0.05
+
+[goals.scene]
+goal = "same-scene"
+
+[train]
+n_updates = 20
+hidden_size = 32
+n_layers = 1
+warmup_updates = 0
+log-every = 10
+[train.dt]
+context_len = 5
+snapshot_every = 10
+
+[methods.BC]
+agent = "bc"
+goal = "scene"
+kind = "control"
+paper = 80.67
+
+[methods."ZeST+DT"]
+agent = "dt"
+goal = "scene"
+
+[evaluate]
+n_episodes = 2
+videos = false
+"""
+
+
+TASK_AND_SIZE = 'task = "micro"\nn_episodes = 4'
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "tiny.toml"
+    path.write_text(text)
+    return path
+
+
+@dataclass(frozen=True)
+class Reproduced:
+    recipe: Path
+    output: Path
+    result: dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def places(short_videos: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """An empty Minari root and an empty cache; the expert is measured on few episodes."""
+    folder = tmp_path_factory.mktemp("reproduce")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
+        patch.setenv("ZEST_CACHE", str(folder / "cache"))
+        patch.setattr(collect, "N_REFERENCE", 2)
+        patch.setattr(collect, "N_NOTHING", 1)
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def whole(places: Path) -> Reproduced:
+    """A recipe that ran to its end."""
+    recipe, output = write(places, RECIPE), places / "whole"
+    config = reproduce.Config(recipe, output, n_workers=1)
+    return Reproduced(recipe, output, reproduce.run(config, reproduce.SilentUi()))
+
+
+@pytest.fixture
+def again(whole: Reproduced, tmp_path: Path, zest: Callable[..., dict[str, Any]]) -> Callable[[], dict[str, Any]]:
+    """Run the recipe again, on a copy of its output in ``tmp_path / "copy"``."""
+    copy = shutil.copytree(whole.output, tmp_path / "copy")
+    return lambda: zest("reproduce", whole.recipe, "--output", copy, "--n-workers", "1")
+
+
+def cell(output: Path, agent: str) -> Path:
+    (folder,) = (output / "cells").glob(f"micro-{agent}-scene-seed0-*")
+    return folder
+
+
+def test_a_recipe_becomes_datasets_policies_a_table_and_a_report(whole: Reproduced) -> None:
+    assert [(name, row["kind"], row["n_seeds"], row["n_episodes"]) for name, row in whole.result["rows"].items()] == [
+        ("Demo", "dataset", 1, 4),
+        ("BC", "control", 1, 2),
+        ("ZeST+DT", "method", 1, 2),
+    ]
+    assert whole.result["n_cells_run"] == 2
+    assert whole.result["rows"]["BC"]["paper"] == 80.67
+    assert whole.result["rows"]["Demo"]["paper"] == 81.19
+    assert reader.exists("zest/kitchen-micro-whole-v0")
+    assert any("-zest-" in name for name in reader.list_datasets())
+    evaluated = artifacts.read_json(next(cell(whole.output, "dt").glob("evaluations/*/result.json")))
+    value = evaluated["summary"]["normalized_return"]["value"]
+    assert whole.result["rows"]["ZeST+DT"]["normalized_return"] == value
+    written = artifacts.read_json(whole.output / "result.json")
+    assert written == json.loads(json.dumps({key: whole.result[key] for key in written}))
+    assert [name.rpartition("-")[0] for name in written["seconds_by_cell"]] == [
+        cell(whole.output, agent).name for agent in ("bc", "dt")
+    ]
+    assert all(min(seconds.values()) > 0 for seconds in written["seconds_by_cell"].values())
+    assert written["tasks"]["micro"]["rows"] == written["rows"]
+    table = (whole.output / "table.md").read_text().splitlines()
+    assert table[0] == "| | % of the expert | 95 % interval | paper |"
+    assert table[4].startswith(f"| ZeST+DT | {value:.2f} | ")
+    html = (whole.output / "report.html").read_text()
+    assert all(part in html for part in ("A tiny comparison", "ZeST+DT", "Tiny.", "same-scene"))
+    assert artifacts.read_json(cell(whole.output, "dt") / "meta.json")["config"]["context_len"] == 5
+    assert len(list(cell(whole.output, "dt").glob("snapshots/update-000000010/evaluations/*/result.json"))) == 1
+    assert "normalized return, %" in html, "the learning curve"
+
+
+def test_the_table_as_text_shows_every_row_and_goal(whole: Reproduced) -> None:
+    lines = reproduce.summary(whole.result).splitlines()
+    assert [line.split()[0] for line in lines[1:4]] == ["Demo", "BC", "ZeST+DT"]
+    assert "80.67" in lines[2]
+    assert lines[4].startswith("micro, goal scene: Spearman ρ of ZeST and true returns ")
+    of_task = {**whole.result["tasks"]["micro"], "spearman_of_zest_and_true_returns": {"scene": None}}
+    undefined = reproduce.summary({**whole.result, "tasks": {"micro": of_task}})
+    assert "true returns undefined" in undefined
+
+
+def test_a_second_run_finds_everything_done_and_says_so(
+    whole: Reproduced, again: Callable[[], dict[str, Any]], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    result = again()
+    assert result["n_cells_run"] == 0
+    assert result["rows"] == whole.result["rows"]
+    cli.main(["reproduce", str(whole.recipe), "--output", str(tmp_path / "copy"), "--n-workers", "1"])
+    out, err = capsys.readouterr()
+    assert "all cells were done already" in err
+    assert err.count("is there already, nothing to do") == 2, "neither collected nor relabeled"
+    assert "0 cells run" in out
+
+
+def test_a_deleted_cell_is_run_again_alone_and_to_the_same_numbers(
+    whole: Reproduced, again: Callable[[], dict[str, Any]], tmp_path: Path
+) -> None:
+    kept = cell(tmp_path / "copy", "bc") / "meta.json"
+    before = kept.stat().st_mtime_ns
+    gone = cell(tmp_path / "copy", "dt")
+    weights = (gone / "model.safetensors").read_bytes()
+    shutil.rmtree(gone)
+    result = again()
+    assert result["n_cells_run"] == 1
+    assert result["rows"] == whole.result["rows"]
+    assert (gone / "model.safetensors").read_bytes() == weights
+    traces = [comparison.latest_evaluation(folder).traces for folder in (gone, cell(whole.output, "dt"))]
+    np.testing.assert_array_equal(traces[0]["qpos"], traces[1]["qpos"])
+    assert kept.stat().st_mtime_ns == before
+
+
+def test_a_deleted_evaluation_of_a_snapshot_is_run_again(again: Callable[[], dict[str, Any]], tmp_path: Path) -> None:
+    (snapshot,) = cell(tmp_path / "copy", "dt").glob("snapshots/update-*")
+    shutil.rmtree(snapshot / "evaluations")
+    assert again()["n_cells_run"] == 1
+    assert len(list(snapshot.glob("evaluations/*/result.json"))) == 1
+
+
+def test_a_deleted_evaluation_is_run_again_without_training(
+    whole: Reproduced, again: Callable[[], dict[str, Any]], tmp_path: Path
+) -> None:
+    bc = cell(tmp_path / "copy", "bc")
+    before = (bc / "meta.json").stat().st_mtime_ns
+    shutil.rmtree(bc / "evaluations")
+    result = again()
+    assert result["n_cells_run"] == 1
+    assert result["rows"] == whole.result["rows"]
+    assert (bc / "meta.json").stat().st_mtime_ns == before
+
+
+def test_another_evaluation_of_a_cell_does_not_slip_into_the_table(
+    whole: Reproduced, again: Callable[[], dict[str, Any]], zest: Callable[..., dict[str, Any]], tmp_path: Path
+) -> None:
+    zest("evaluate", cell(tmp_path / "copy", "bc"), "--n-episodes", "1", "--n-workers", "1", "--no-videos")
+    result = again()
+    assert result["n_cells_run"] == 0
+    assert result["rows"] == whole.result["rows"]
+
+
+def test_whatever_a_result_depends_on_makes_a_cell_of_its_own(whole: Reproduced, tmp_path: Path) -> None:
+    source = whole.result["tasks"]["micro"]["dataset"]["dataset"]
+    goals = {"scene": next(name for name in reader.list_datasets() if "-zest-" in name)}
+
+    def cells(old: str = "", new: str = "") -> dict[str, str]:
+        plan = read_plan(write(tmp_path, RECIPE.replace(old, new)))
+        planned = plan_cells(plan, {"micro": TaskData(source, goals)}, whole.output)
+        return {each.method: each.run.name for each in planned}
+
+    first = cells()
+    assert all((whole.output / "cells" / name).is_dir() for name in first.values())
+    assert cells("A tiny", "Another") == first
+    assert cells("n_episodes = 2", "n_episodes = 3") == first, "another evaluation is no other training"
+    assert not set(cells("n_updates = 20", "n_updates = 21").values()) & set(first.values())
+    longer = cells("context_len = 5", "context_len = 6")
+    assert longer["BC"] == first["BC"]
+    assert longer["ZeST+DT"] != first["ZeST+DT"]
+
+
+def test_the_flags_of_a_method_win_over_those_of_its_agent_and_these_over_the_shared(
+    whole: Reproduced, tmp_path: Path
+) -> None:
+    text = RECIPE.replace("seeds = [0]", "seeds = [3, 1]").replace("context_len = 5", "context_len = 5\nn_updates = 21")
+    text += '\n[methods."short DT"]\nagent = "dt"\ngoal = "scene"\nn_updates = 22\n'
+    source = whole.result["tasks"]["micro"]["dataset"]["dataset"]
+    goals = {"scene": next(name for name in reader.list_datasets() if "-zest-" in name)}
+    planned = plan_cells(read_plan(write(tmp_path, text)), {"micro": TaskData(source, goals)}, whole.output)
+    assert [(each.train["seed"], each.method, each.train["n_updates"]) for each in planned] == [
+        (3, "BC", 20), (3, "ZeST+DT", 21), (3, "short DT", 22), (1, "BC", 20), (1, "ZeST+DT", 21), (1, "short DT", 22),
+    ], "all of the first seed come first"  # fmt: skip
+
+
+def test_a_policy_that_was_trained_elsewhere_is_a_method_like_the_others(
+    whole: Reproduced,
+    refusal: Callable[..., tuple[int, str]],
+    tmp_path: Path,
+) -> None:
+    policy = tmp_path / "{task}-{seed}.pt"
+    text = f'\n[methods.Theirs]\npolicy = "torchscript:{policy}"\ngoal = "scene"\nkind = "control"\n'
+    recipe = write(tmp_path, RECIPE + text)
+    output = shutil.copytree(whole.output, tmp_path / "other")
+    code, message = refusal("reproduce", recipe, "--output", output, "--n-workers", "1")
+    assert code == 2
+    goal = next(name for name in reader.list_datasets() if "-zest-" in name)
+    assert "policies from elsewhere are missing; train them, then go on:\n" in message
+    assert f"'Theirs', trained on {goal} with seed 0: there is no file {tmp_path / 'micro-0.pt'}" in message
+    torch.jit.trace(torch.nn.Linear(59, 9), torch.zeros(1, 59)).save(str(tmp_path / "micro-0.pt"))
+    config = reproduce.Config(recipe, output, n_workers=1)
+    first = reproduce.run(config, reproduce.SilentUi())
+    assert first["n_cells_run"] == 1
+    assert {name: row for name, row in first["rows"].items() if name != "Theirs"} == whole.result["rows"]
+    row = first["rows"]["Theirs"]
+    (run,) = (output / "cells").glob("micro-foreign-scene-seed0-*")
+    assert artifacts.read_json(run / "meta.json")["name"] == "Theirs"
+    assert (row["kind"], row["n_seeds"], row["n_episodes"]) == ("control", 1, 2)
+    assert reproduce.run(config, reproduce.SilentUi())["n_cells_run"] == 0
+    torch.jit.trace(torch.nn.Linear(59, 9), torch.zeros(1, 59)).save(str(tmp_path / "micro-0.pt"))
+    assert reproduce.run(config, reproduce.SilentUi())["n_cells_run"] == 1, "another file is another policy"
+    assert len(list((output / "cells").glob("micro-foreign-scene-seed0-*"))) == 2
+
+
+def test_one_task_may_have_several_datasets(tmp_path: Path) -> None:
+    tables = "".join(
+        f"[tasks.at-{level}]\ntask = 'micro'\nlevel = {level}\ndataset = 'zest/at-{level}-v0'\n" for level in (60, 95)
+    )
+    shared = RECIPE.replace('task = "micro"\n', "").replace('dataset = "zest/kitchen-micro-whole-v0"\n', "")
+    plan = read_plan(write(tmp_path, shared.replace("[relabel]", f"{tables}\n[relabel]")))
+    assert {name: (config.task, config.level) for name, config in plan.collect.items()} == {
+        "at-60": ("micro", 60.0),
+        "at-95": ("micro", 95.0),
+    }
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ('goal = "same-scene"', 'goal = "same-scene"\ngoal_share = 7.0', "goal_share must be in"),
+        ("[evaluate]", "[evalute]", "unknown key 'evalute'; did you mean 'evaluate'"),
+        ('title = "A tiny comparison"', "", "'title' is required"),
+        ('title = "A tiny comparison"', 'verb = "train dt"', "is for `zest train dt --recipe"),
+        ('title = "A tiny comparison"', 'verb = "select goals"', "unknown key 'collect'"),
+        ("seeds = [0]", 'seeds = ["0"]', "'seeds' must be a list of an integer, got ['0']"),
+        ("seeds = [0]", "seeds = [0, 0]", "seeds must be at least 1 number, all different"),
+        ("[relabel]", "[relabel.all]", "[goals.'scene']: unknown key 'all'"),
+        ("[methods.BC]", "[methods]", "'methods' must be a table of tables"),
+        ("[train.dt]", "[train.bcc]", "unknown key 'bcc'"),
+        (TASK_AND_SIZE, '[tasks.report]\ntask = "micro"', "the name becomes a file's beside report.html"),
+        ("[relabel]", "[tasks.micro]\n[relabel]", "[collect]: 'task' is not for a recipe to set"),
+        ('task = "micro"', 'task = "mirco"', "[collect]: unknown task 'mirco'; did you mean 'micro'"),
+        ("noise_max = 1.0", "noise_max = 3.0", "[collect]: noise_max must be in [0, 2.0], got 3.0"),
+        ("n_episodes = 4", "n_episodes = 4\nlevel = 0", "level must be in (0, 100] percent of the expert, got 0.0"),
+        ('goal = "same-scene"', 'goal = "same-scen"', "[goals.'scene']: unknown goal 'same-scen'"),
+        ('goal = "same-scene"', 'goal = "visual-tasks:real_imgs"', "set it to your copy of the Visual Tasks Dataset"),
+        (TASK_AND_SIZE, "[tasks.micro]\nn_episodes = 3\n[tasks.sdoor]\nn_episodes = 4", "every task needs as many"),
+        (TASK_AND_SIZE, '[tasks."a/b"]\ntask = "micro"', "the name becomes a file's"),
+        (TASK_AND_SIZE, "[tasks.mirco]", "unknown task 'mirco'; did you mean 'micro'"),
+        ("noise_max = 1.0", "noise-maxx = 1.0", "[collect]: unknown key 'noise-maxx'; did you mean 'noise-max'"),
+        ("n_updates = 20", 'n_updates = "many"', "'n_updates' must be an integer, got 'many'"),
+        ("hidden_size = 32", "hidden_size = 0", "hidden_size must be at least 1, got 0"),
+        ('agent = "bc"', "", "[methods.'BC']: a method has either an agent or a policy, got None and None"),
+        ('agent = "bc"', 'agent = "bcc"', "unknown agent 'bcc'; did you mean 'bc'"),
+        ('kind = "control"', 'kind = "baseline"', "'kind' must be one of 'method', 'control', got 'baseline'"),
+        ("context_len = 5", "contextlen = 5", "unknown key 'contextlen'; did you mean 'context-len'"),
+        ("context_len = 5", 'dataset = "zest/x-v0"', "'dataset' is not for a recipe to set"),
+        ('"dt"\ngoal = "scene"', '"dt"\ngoal = "sceen"', "unknown goal 'sceen'; did you mean 'scene'"),
+        ("n_episodes = 2", "n_episodes = 0", "n_episodes must be at least 1, got 0"),
+        ("n_episodes = 2", 'rtg = "offline"', "'rtg' must be one of 'online', 'constant', 'schedule', got 'offline'"),
+        ('agent = "bc"', 'agent = "bc"\npolicy = "onnx:x"', "either an agent or a policy, got 'bc' and 'onnx:x'"),
+        ('agent = "bc"', 'policy = "onnx:x"\nhidden_size = 1', "[methods.'BC']: unknown key 'hidden_size'"),
+        ('agent = "bc"', 'policy = "onxn:x"', "[methods.'BC']: unknown kind of policy 'onxn'; did you mean 'onnx'?"),
+        ('agent = "bc"', 'policy = "d3rlpy:x.d3"', "[methods.'BC']: a Python belongs to d3rlpy:FILE.d3"),
+        ('agent = "bc"', 'policy = "onnx:x"\nseed = 1', "'seed' is not for a recipe to set"),
+        (
+            "[relabel]",
+            '[tasks.micro]\n[tasks.sdoor]\n[methods.A]\npolicy = "onnx:x"\n[relabel]',
+            "must hold {task}, got",
+        ),
+        ("seeds = [0]", 'seeds = [0, 1]\nmethods.A.policy = "onnx:x"', "the policy must hold {seed}, got 'onnx:x'"),
+    ],
+)
+def test_a_bad_recipe_is_refused_before_anything_runs(
+    old: str,
+    new: str,
+    complaint: str,
+    refusal: Callable[..., tuple[int, str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("ZEST_VISUAL_TASKS", raising=False)
+    assert RECIPE.count(old) == 1
+    recipe = write(tmp_path, RECIPE.replace(old, new))
+    code, message = refusal("reproduce", recipe, "--output", tmp_path / "out")
+    assert code == 2
+    assert complaint in message
+    assert str(recipe) in message
+    assert list(tmp_path.iterdir()) == [recipe]
+
+
+def test_several_tasks_make_a_page_each_and_one_over_all_and_share_what_is_equal(
+    whole: Reproduced, tmp_path: Path, zest: Callable[..., dict[str, Any]]
+) -> None:
+    text = RECIPE.replace('task = "micro"\n', "").replace("micro-whole", "{task}-whole")
+    text = text.replace("[relabel]", "[tasks.micro]\n[tasks.sdoor]\nnoise_max = 1.5\n[relabel]")
+    text += """
+[methods."constant RTG"]
+agent = "dt"
+goal = "scene"
+context_len = 5
+kind = "control"
+evaluate = {rtg = "constant"}
+"""
+    copy = shutil.copytree(whole.output, tmp_path / "copy")
+    result = zest("reproduce", write(tmp_path, text), "--output", copy, "--n-workers", "1")
+    assert result["n_cells_run"] == 4, "two on micro are done"
+    assert len(list((copy / "cells").glob("[!.]*"))) == 4, "two methods share a policy"
+    assert result["tasks"]["micro"]["rows"]["ZeST+DT"] == whole.result["rows"]["ZeST+DT"]
+    assert result["tasks"]["sdoor"]["dataset"]["noise_max"] == 1.5
+    for name, row in result["rows"].items():
+        of_tasks = [result["tasks"][task]["rows"][name] for task in ("micro", "sdoor")]
+        assert row["normalized_return"] == pytest.approx(np.mean([of["normalized_return"] for of in of_tasks]))
+        assert row["n_episodes"] == sum(of["n_episodes"] for of in of_tasks)
+    assert (copy / "table.md").read_text().startswith("| | % of the expert | 95 % interval | micro | sdoor | paper |")
+    overview = (copy / "report.html").read_text()
+    assert all(
+        part in overview for part in ('href="micro.html"', 'href="sdoor.html"', "sdoor: scene", "over 2 datasets")
+    )
+    assert "data:video/mp4" in (copy / "sdoor.html").read_text()
+    lines = reproduce.summary(result).splitlines()
+    assert sum(line.startswith("sdoor: Demo ") for line in lines) == 1
+
+
+def test_a_recipe_without_methods_ends_with_what_its_rewards_are_worth(
+    whole: Reproduced, tmp_path: Path, zest: Callable[..., dict[str, Any]], refusal: Callable[..., tuple[int, str]]
+) -> None:
+    without_methods = RECIPE[: RECIPE.index("[train]")]
+    result = zest("reproduce", write(tmp_path, without_methods), "--output", tmp_path / "out", "--n-workers", "1")
+    (dataset,) = result["datasets"]
+    assert reader.read_metadata(dataset)["zest"]["relabel"]["source"] == "zest/kitchen-micro-whole-v0"
+    assert "Spearman ρ" in next(iter(result["datasets"].values()))["figures"]
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["datasets"] == result["datasets"]
+    assert "Views" in (tmp_path / "out" / "report.html").read_text()
+    assert "Spearman ρ" in reproduce.summary(result)
+    nothing = without_methods[: without_methods.index("[goals.scene]")]
+    code, message = refusal("reproduce", write(tmp_path, nothing))
+    assert (code, "at least 1 method, or 1 goal to inspect" in message) == (2, True)
+
+
+@pytest.mark.slow
+def test_a_reproduction_killed_in_training_goes_on_and_ends_with_the_same_bits(
+    places: Path, tmp_path: Path, zest: Callable[..., dict[str, Any]]
+) -> None:
+    recipe = write(tmp_path, RECIPE.replace("n_updates = 20", "n_updates = 600\ncheckpoint_every = 100"))
+    cut = tmp_path / "cut"
+    code = (
+        "import sys; from zest_rl import cli, collect\n"
+        "if __name__ == '__main__':\n"
+        "    collect.N_REFERENCE, collect.N_NOTHING = 2, 1\n"
+        "    sys.exit(cli.main(sys.argv[1:]))\n"
+    )
+    script = tmp_path / "script.py"
+    script.write_text(code)
+    words = ["reproduce", str(recipe), "--output", str(cut), "--n-workers", "2"]
+    with subprocess.Popen([sys.executable, str(script), *words], stderr=subprocess.DEVNULL) as process:
+        while not list(cut.glob("cells/micro-dt-*/checkpoints/update-*")):
+            assert process.poll() is None, "it ended before it could be killed"
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+    assert not (cell(cut, "dt") / "meta.json").exists()
+    resumed = zest("reproduce", recipe, "--output", cut, "--n-workers", "1")
+    whole = zest("reproduce", recipe, "--output", tmp_path / "whole", "--n-workers", "1")
+    assert resumed["rows"] == whole["rows"]
+    for method in ("bc", "dt"):
+        one, other = (cell(tmp_path / name, method) for name in ("cut", "whole"))
+        assert (one / "model.safetensors").read_bytes() == (other / "model.safetensors").read_bytes()
+        traces = [comparison.latest_evaluation(folder).traces for folder in (one, other)]
+        np.testing.assert_array_equal(traces[0]["qpos"], traces[1]["qpos"])

@@ -1,0 +1,394 @@
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from zest_rl.data import reader
+from zest_rl.errors import BadInput, ZestError
+from zest_rl.sources import open_source
+
+READERS: dict[str, Callable[[str], Any]] = {
+    "read_metadata": reader.read_metadata,
+    "read_episodes": reader.read_episodes,
+    "read_states": reader.read_states,
+    "read_ground_truth": reader.read_ground_truth,
+    "read_scores": reader.read_scores,
+    "fingerprint": reader.fingerprint,
+    "describe": reader.describe,
+    "task_name": reader.task_name,
+}
+
+
+@contextmanager
+def edited(dataset_id: str) -> Iterator[h5py.File]:
+    """Change a dataset's arrays on purpose: without a manifest, as datasets of other programs come."""
+    folder = reader.dataset_path(dataset_id)
+    (folder / reader.MANIFEST_FILE).unlink(missing_ok=True)
+    with h5py.File(folder / reader.DATA_FILE, "r+") as file:
+        yield file
+
+
+def replace_array(dataset_id: str, name: str, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    with edited(dataset_id) as file:
+        changed = change(file[name][()])
+        del file[name]
+        file[name] = changed
+
+
+def change_metadata(dataset_id: str, **values: Any) -> None:
+    folder = reader.dataset_path(dataset_id)
+    (folder / reader.MANIFEST_FILE).unlink(missing_ok=True)
+    metadata = json.loads((folder / reader.METADATA_FILE).read_text())
+    (folder / reader.METADATA_FILE).write_text(json.dumps({**metadata, **values}))
+
+
+# --- ids --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "dataset_id",
+    ["", "..", "../x-v0", "zest/../../x-v0", "x", "a/b", "a/b-v0", "zest/", "/zest/x-v0", "zest//x-v0", "zest/x-v",
+     "zest/x-v0/", "zest/x-v0\n", "zest/.x-v0", "zest/x y-v0", "zest/x\\y-v0", "~/x-v0", "zest/x..y-v0", "C:/x-v0"],
+)  # fmt: skip
+def test_a_malformed_id_is_refused_before_anything_is_made(
+    dataset_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    for read in (reader.dataset_path, reader.exists, *READERS.values()):
+        with pytest.raises(BadInput, match="a dataset id must look like 'namespace/name-v0'"):
+            read(dataset_id)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("dataset_id", ["zest/kitchen-micro-noisy-v0", "kitchen-v12", "a1/b.c/d_e-f-v3", "zest/v-v0"])
+def test_a_well_formed_id_is_a_folder_below_the_root(
+    dataset_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    assert reader.dataset_path(dataset_id) == tmp_path / dataset_id
+    assert not reader.exists(dataset_id)
+
+
+@given(st.lists(st.sampled_from(["..", ".", "/", "a", "zest", "-v0", "x-v0", "~", "\\", "\n", " "]), max_size=6))
+def test_no_id_leads_out_of_the_root(parts: list[str]) -> None:
+    try:
+        path = reader.dataset_path("".join(parts))
+    except BadInput:
+        return
+    assert path.resolve().is_relative_to(reader.datasets_root().resolve())
+    assert path != reader.datasets_root()
+
+
+def test_the_root_is_where_minari_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    assert reader.datasets_root() == tmp_path / "minari"
+    monkeypatch.delenv("MINARI_DATASETS_PATH")
+    assert reader.datasets_root() == Path.home() / ".minari/datasets"
+
+
+@pytest.mark.parametrize("read", READERS.values(), ids=READERS)
+def test_a_missing_dataset_names_the_nearest(read: Callable[[str], Any], collected: str) -> None:
+    with pytest.raises(BadInput, match=rf"no dataset 'zest/kitchen-mirco-tiny-v0' .*did you mean '{collected}'\?"):
+        read("zest/kitchen-mirco-tiny-v0")
+
+
+def test_without_any_dataset_the_message_says_how_to_make_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    with pytest.raises(BadInput, match=r"valid: \(none\)\. Make one with `zest collect`"):
+        reader.read_episodes("zest/x-v0")
+    assert reader.list_datasets() == []
+
+
+def test_complete_datasets_are_listed_and_staged_ones_are_not(collected: str) -> None:
+    folder = reader.dataset_path(collected)
+    shutil.copytree(folder, folder.parent / ".other-v0.staging")
+    shutil.copytree(folder, reader.datasets_root() / "alone-v1")
+    assert reader.list_datasets() == ["alone-v1", collected]
+    assert reader.exists(collected)
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_read_fits_together(collected: str) -> None:
+    episodes, states, truths = (
+        reader.read_episodes(collected),
+        reader.read_states(collected),
+        reader.read_ground_truth(collected),
+    )
+    assert [len(episode) for episode in episodes] == [100] * 4
+    for episode, qpos, truth in zip(episodes, states, truths, strict=True):
+        assert episode.obs.shape == (101, 59)
+        assert episode.actions.shape == (100, 9)
+        assert not episode.terminated
+        assert qpos.shape == (101, 30)
+        assert qpos.dtype == np.float64
+        np.testing.assert_array_equal(episode.obs[:, :9], qpos[:, :9].astype(np.float32))
+        np.testing.assert_array_equal(episode.rewards, truth.rewards)
+        assert truth.success == bool(truth.rewards.max() >= 0.999)
+
+
+def test_episodes_are_read_in_the_order_of_their_numbers(collected: str) -> None:
+    with edited(collected) as file:
+        for i in range(4, 11):
+            file.copy(f"episode_{i % 4}", f"episode_{i}")
+    found = reader.read_episodes(collected)
+    assert len(found) == 11
+    for i, episode in enumerate(found):
+        np.testing.assert_array_equal(episode.actions, found[i % 4].actions)
+    assert (found[1].actions != found[2].actions).any()
+
+
+def test_a_gap_in_their_numbers_is_refused_for_minari_could_not_read_it(collected: str) -> None:
+    with edited(collected) as file:
+        file.move("episode_1", "episode_10")
+    with pytest.raises(BadInput, match="must hold episode_0, … episode_3, as Minari needs it, but episode_1 is"):
+        reader.read_episodes(collected)
+
+
+def test_only_the_ground_truth_reader_opens_the_ground_truth(collected: str) -> None:
+    before = reader.read_episodes(collected), reader.read_states(collected), reader.fingerprint(collected)
+    with edited(collected) as file:
+        for episode in file.values():
+            del episode["infos/gt"]
+    np.testing.assert_array_equal(reader.read_episodes(collected)[0].obs, before[0][0].obs)
+    np.testing.assert_array_equal(reader.read_states(collected)[0], before[1][0])
+    assert reader.fingerprint(collected) == before[2]
+    with pytest.raises(BadInput, match="no 'infos/gt/reward' in /episode_0; record it when the dataset is made"):
+        reader.read_ground_truth(collected)
+
+
+def test_the_first_ground_truth_reward_belongs_to_the_reset_and_to_no_action(collected: str) -> None:
+    replace_array(collected, "episode_0/infos/gt/reward", lambda reward: np.arange(101, dtype=np.float32))
+    np.testing.assert_array_equal(reader.read_ground_truth(collected)[0].rewards, np.arange(1, 101))
+
+
+def test_a_dataset_that_was_not_relabeled_has_no_scores(collected: str) -> None:
+    with pytest.raises(BadInput, match=rf"episode_0 of dataset {collected}: .*no 'infos/zest/score'"):
+        reader.read_scores(collected)
+
+
+# --- datasets that break a rule ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "rule"),
+    [
+        ("observations", lambda a: np.where(np.arange(101)[:, None] == 5, np.nan, a), "obs must be finite.*index 5"),
+        ("actions", lambda a: np.full_like(a, np.inf), "actions must be finite, but 100 of 100"),
+        ("rewards", lambda a: np.full_like(a, np.nan), "rewards must be finite"),
+        ("observations", lambda a: a[:-1], r"obs must have shape \(101, \?\).*got shape \(100, 59\)"),
+        ("rewards", lambda a: a[:-1], r"rewards must have shape \(100\)"),
+        ("actions", lambda a: a[:0], "an episode must have at least 1 step, got 0"),
+        ("actions", lambda a: a[:, 0], r"actions must have shape \(100, \?\)"),
+    ],
+)
+def test_a_broken_episode_is_named_with_its_dataset(
+    collected: str, name: str, change: Callable[[np.ndarray], np.ndarray], rule: str
+) -> None:
+    replace_array(collected, f"episode_2/{name}", change)
+    with pytest.raises(BadInput, match=rf"episode_2 of dataset {collected}: {rule}"):
+        reader.read_episodes(collected)
+
+
+@pytest.mark.parametrize(
+    ("change", "rule"),
+    [
+        (lambda a: a[:-1], r"qpos must have shape \(101, nq\), got \(100, 30\)"),
+        (lambda a: a[:, 0], r"qpos must have shape \(101, nq\), got \(101,\)"),
+        (lambda a: np.full_like(a, np.nan), "qpos must be finite"),
+    ],
+)
+def test_a_broken_recorded_state_is_named(
+    collected: str, change: Callable[[np.ndarray], np.ndarray], rule: str
+) -> None:
+    replace_array(collected, "episode_1/infos/state/qpos", change)
+    with pytest.raises(BadInput, match=rf"episode_1 of dataset {collected}: infos/state/{rule}"):
+        reader.read_states(collected)
+
+
+def test_an_episode_without_steps_has_no_states(collected: str) -> None:
+    replace_array(collected, "episode_1/rewards", lambda rewards: rewards[:0])
+    with pytest.raises(BadInput, match=rf"episode_1 of dataset {collected}: .*at least 1 step"):
+        reader.read_states(collected)
+
+
+@pytest.mark.parametrize("name", ["observations", "actions", "rewards", "terminations"])
+def test_a_missing_array_is_named(collected: str, name: str) -> None:
+    with edited(collected) as file:
+        del file[f"episode_0/{name}"]
+    with pytest.raises(BadInput, match=rf"no '{name}' in /episode_0"):
+        reader.read_episodes(collected)
+
+
+def test_a_dictionary_of_pictures_alone_is_refused(collected: str) -> None:
+    with edited(collected) as file:
+        del file["episode_0/observations"]
+        file["episode_0/observations/camera"] = np.zeros((101, 8, 8, 3), np.uint8)
+    with pytest.raises(BadInput, match=r"/episode_0/observations holds pictures only; a policy here needs numbers"):
+        reader.read_episodes(collected)
+
+
+def test_a_dataset_without_episodes_is_refused(collected: str) -> None:
+    with edited(collected) as file:
+        file.clear()
+    with pytest.raises(BadInput, match="has no episodes; collect it again"):
+        reader.read_episodes(collected)
+
+
+# --- damage and code --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [reader.DATA_FILE, reader.METADATA_FILE])
+def test_one_flipped_bit_is_noticed(collected: str, name: str) -> None:
+    path = reader.dataset_path(collected) / name
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    for read in (reader.read_metadata, reader.read_episodes, reader.fingerprint):
+        with pytest.raises(
+            ZestError, match=rf"{name} of dataset {collected} is missing or was changed since"
+        ) as caught:
+            read(collected)
+        assert not isinstance(caught.value, BadInput)
+
+
+def test_a_missing_data_file_is_noticed(collected: str) -> None:
+    (reader.dataset_path(collected) / reader.DATA_FILE).unlink()
+    with pytest.raises(ZestError, match=r"main_data\.hdf5 .* is missing"):
+        reader.read_episodes(collected)
+
+
+def test_a_truncated_file_of_another_program_is_a_clear_error(collected: str) -> None:
+    folder = reader.dataset_path(collected)
+    (folder / reader.MANIFEST_FILE).unlink()
+    content = (folder / reader.DATA_FILE).read_bytes()
+    (folder / reader.DATA_FILE).write_bytes(content[: len(content) // 2])
+    with pytest.raises(BadInput, match=rf"dataset {collected} cannot be read as HDF5"):
+        reader.read_episodes(collected)
+
+
+def test_a_damaged_block_of_a_compressed_file_is_a_clear_error(collected: str) -> None:
+    with edited(collected) as file:
+        actions = file["episode_1/actions"][()]
+        del file["episode_1/actions"]
+        stored = file.create_dataset("episode_1/actions", data=actions, compression="gzip")
+        block = stored.id.get_chunk_info(0)
+    path = reader.dataset_path(collected) / reader.DATA_FILE
+    content = bytearray(path.read_bytes())
+    content[block.byte_offset : block.byte_offset + block.size] = bytes(block.size)
+    path.write_bytes(content)
+    with pytest.raises(ZestError, match=rf"episode_1 of dataset {collected} is damaged .*make it again"):
+        reader.read_episodes(collected)
+
+
+@pytest.fixture
+def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Entry point of a package that leaves a file when it is imported."""
+    (tmp_path / "sprung").unlink(missing_ok=True)
+    (tmp_path / "foreign_package.py").write_text(f"open({str(tmp_path / 'sprung')!r}, 'w')\ndef make(**kw): pass\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield "foreign_package:make"
+    sys.modules.pop("foreign_package", None)
+
+
+@pytest.mark.parametrize("key", ["env_spec", "eval_env_spec"])
+@pytest.mark.parametrize("hidden_in_wrapper", [False, True])
+def test_a_dataset_of_foreign_code_is_read_without_running_it_and_no_environment_is_built_from_it(
+    collected: str, trap: str, tmp_path: Path, key: str, hidden_in_wrapper: bool
+) -> None:
+    spec = json.loads(reader.read_metadata(collected)["env_spec"])
+    if hidden_in_wrapper:
+        spec["additional_wrappers"] = [{"name": "Trap", "entry_point": trap, "kwargs": {}}]
+    else:
+        spec["entry_point"] = trap
+    change_metadata(collected, **{key: json.dumps(spec)})
+    for name in READERS.keys() - {"read_scores", "task_name"}:  # they need other datasets than this
+        READERS[name](collected)
+    if key == "env_spec":
+        with pytest.raises(BadInput, match=rf"the {key} of dataset {collected} would run code of '{trap}'; only"):
+            open_source(collected, cameras=["left"])
+    assert not (tmp_path / "sprung").exists()
+    assert "foreign_package" not in sys.modules
+
+
+def test_the_trap_does_spring_when_nobody_checks(collected: str, trap: str, tmp_path: Path) -> None:
+    import gymnasium
+
+    spec = gymnasium.envs.registration.EnvSpec.from_json(reader.read_metadata(collected)["env_spec"])
+    wrapper = gymnasium.envs.registration.WrapperSpec("Trap", trap, {})
+    spec.additional_wrappers = (wrapper,)
+    with pytest.raises((TypeError, AttributeError)):
+        gymnasium.make(spec).reset()
+    assert (tmp_path / "sprung").exists()
+
+
+@pytest.mark.parametrize("spec", ["{", "null", "[]", "{}", '{"entry_point": "zest_rl.x", "additional_wrappers": 3}'])
+def test_a_malformed_env_spec_is_refused(collected: str, spec: str) -> None:
+    change_metadata(collected, env_spec=spec)
+    with pytest.raises(BadInput, match=rf"the env_spec of dataset {collected} is not the JSON of a Gymnasium EnvSpec"):
+        reader.read_metadata(collected)
+
+
+@pytest.mark.parametrize("name", ["gymnasium.envs.x:Y", "gymnasium_robotics.envs.x:Y", "zest_rl.envs:KitchenEnv"])
+def test_known_packages_are_trusted(name: str) -> None:
+    reader.check_env_spec(json.dumps({"entry_point": name, "additional_wrappers": []}), "it", "stop")
+    with pytest.raises(BadInput, match="it would run code of"):
+        reader.check_env_spec(json.dumps({"entry_point": name.replace(".", "_evil.", 1)}), "it", "stop")
+
+
+# --- identity ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_fingerprint_sees_inputs_and_states_but_no_rewards(collected: str) -> None:
+    before = reader.fingerprint(collected)
+    replace_array(collected, "episode_0/rewards", lambda rewards: rewards + 1)
+    assert reader.fingerprint(collected) == before
+    seen = {before}
+    for name in ("observations", "actions", "infos/state/qpos", "terminations"):
+        replace_array(collected, f"episode_3/{name}", lambda array: ~array if array.dtype == bool else array + 1e-3)
+        seen.add(reader.fingerprint(collected))
+    assert len(seen) == 5
+
+
+def test_a_description_sees_rewards_and_leaves_out_who_made_it_where(collected: str) -> None:
+    collect = {"asked": {"task": "micro"}, "provenance": {"command": "zest collect"}}
+    change_metadata(collected, zest={"collect": collect})
+    before = reader.describe(collected)
+    assert before["id"] == collected
+    assert before["zest"] == {"collect": {"asked": {"task": "micro"}}}
+    assert (before["ref_min_score"], before["ref_max_score"]) == (0.0, 70.0)
+    assert json.loads(json.dumps(before)) == before
+    replace_array(collected, "episode_0/rewards", lambda rewards: rewards + 1)
+    after = reader.describe(collected)
+    assert after["rewards_sha256"] != before["rewards_sha256"]
+    assert {**after, "rewards_sha256": None} == {**before, "rewards_sha256": None}
+
+
+@pytest.mark.parametrize("key", ["env_spec", "ref_min_score", "ref_max_score"])
+def test_a_dataset_that_no_policy_could_be_evaluated_on_cannot_be_described(collected: str, key: str) -> None:
+    change_metadata(collected, **{key: None})
+    with pytest.raises(BadInput, match=f"has no {key} in its metadata"):
+        reader.describe(collected)
+
+
+def test_the_task_is_that_of_the_environment(collected: str) -> None:
+    assert reader.task_name(collected) == "micro"
+
+
+@pytest.mark.parametrize("spec", [None, {"id": "Pendulum-v1", "entry_point": "gymnasium.envs.x:Y", "kwargs": {}}])
+def test_a_dataset_of_another_environment_has_no_task(collected: str, spec: dict[str, Any] | None) -> None:
+    change_metadata(collected, env_spec=spec and json.dumps(spec))
+    with pytest.raises(BadInput, match="frames can be rendered for zest/Kitchen-v1 only"):
+        reader.task_name(collected)

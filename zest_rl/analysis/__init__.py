@@ -1,0 +1,1 @@
+"""Datasets, episodes and videos → figures about them."""

@@ -1,0 +1,60 @@
+"""One episode of a relabeled dataset → what a person looks at: a strip of frames with their scores, and each view's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.rewards.scorer import Scorer
+from zest_rl.simulation.views import canonical_states, evenly_spaced
+from zest_rl.types import FloatArray
+
+N_FRAMES = 8
+"""Frames of a strip."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """How the score sees one episode; what is not looked at is neither rendered nor scored."""
+
+    scorer: Scorer
+    """Of the dataset."""
+    states: NDArray[np.float64]
+    """(T+1, nq) simulator positions."""
+
+    @cached_property
+    def steps(self) -> NDArray[np.intp]:
+        """(n,) which steps `frames` shows, evenly spaced over the episode."""
+        return evenly_spaced(len(self.states), N_FRAMES)
+
+    @cached_property
+    def frames(self) -> NDArray[np.uint8]:
+        """(n, H, W, 3) frames of the middle view at `steps`."""
+        frames, index = self._render(self.states[self.steps])
+        return np.asarray(frames[index, frames.shape[1] // 2])
+
+    @cached_property
+    def scores(self) -> FloatArray:
+        """(T+1,) of all views together."""
+        return self.scorer.score_episodes([self.states])[0][0]
+
+    @cached_property
+    def by_view(self) -> FloatArray:
+        """(V, T+1), each view's own."""
+        return self.scorer.score_by_view(self.states)
+
+    @cached_property
+    def pixel_difference(self) -> FloatArray:
+        """(T+1,) mean absolute difference to the first frame, over pixels and views, in [0, 255]."""
+        frames, index = self._render(self.states)
+        first = frames[index[0]].astype(np.int16)
+        return np.array([np.abs(frame - first).mean() for frame in frames], dtype=np.float32)[index]
+
+    def _render(self, states: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
+        """Render each distinct state once: (U, V, H, W, 3), and which of them each state is."""
+        views = self.scorer.config.views
+        distinct, index = np.unique(canonical_states(states, views), axis=0, return_inverse=True)
+        return np.stack([views.shared_renderer().render(state) for state in distinct]), index.reshape(-1)

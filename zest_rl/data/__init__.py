@@ -1,0 +1,1 @@
+"""Minari datasets, pictures and videos on disk, read and written."""

@@ -1,0 +1,376 @@
+"""Episodes → Minari datasets: staged, verified, locked and renamed once; nothing is ever half written.
+
+The layout on disk is drawn in `zest_rl.data.reader`, the alignment of the arrays in `zest_rl.types`.
+"""
+
+from __future__ import annotations
+
+import errno
+import multiprocessing
+import os
+import shutil
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.data.reader import (
+    DATA_FILE,
+    MANIFEST_FILE,
+    METADATA_FILE,
+    SOURCE_REWARD,
+    dataset_path,
+    exists,
+    fingerprint,
+    read_lengths,
+    read_metadata,
+    rewards_to_keep,
+)
+from zest_rl.errors import BadInput, ZestError
+from zest_rl.runtime import artifacts
+from zest_rl.runtime.parallel import die_with_parent, starting_children
+from zest_rl.types import Episode, FloatArray
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One collected episode, everything that is stored of it (T steps)."""
+
+    seed: int
+    obs: FloatArray
+    """(T+1, obs_dim) float32."""
+    actions: FloatArray
+    """(T, act_dim) float32."""
+    terminated: bool
+    qpos: NDArray[np.float64]
+    """(T+1, nq) simulator positions; frames are rendered from them."""
+    qvel: NDArray[np.float64]
+    """(T+1, nv) simulator velocities."""
+    gt_reward: FloatArray
+    """(T+1,) float32; the first belongs to the reset."""
+    gt_success: NDArray[np.bool_]
+    """(T+1,) bool."""
+
+    def __post_init__(self) -> None:
+        Episode(self.obs, self.actions, self.gt_reward[1:], self.terminated)  # it checks shapes, types, finiteness
+        wrong = [name for name in ("qpos", "qvel", "gt_success") if len(getattr(self, name)) != len(self.obs)]
+        if wrong:
+            raise BadInput(f"{' and '.join(wrong)} must have T + 1 = {len(self.obs)} rows, as many as obs")
+
+
+def _in_child(build: Callable[..., None], *args: object) -> None:
+    """Run an HDF5 write in a process of its own: on a full disk the library kills its process."""
+    context = multiprocessing.get_context("spawn")
+    receive, send = context.Pipe(duplex=False)
+    child = context.Process(target=_report_errors, args=(send, build, *args))
+    with starting_children():
+        child.start()
+    send.close()
+    try:
+        message = receive.recv()
+    except EOFError:
+        message = "the writing process died, as HDF5 does on a full disk"
+    child.join()
+    if message is not None:
+        raise ZestError(f"the dataset could not be written: {message}; nothing was left behind, try again")
+
+
+def _report_errors(send: Any, build: Callable[..., None], *args: object) -> None:
+    die_with_parent()  # else it would go on writing where the next try writes
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # on a full disk HDF5 prints hundreds of tracebacks
+    try:
+        build(*args)
+    except Exception as error:
+        full = os.strerror(errno.ENOSPC) in str(error)
+        send.send("the disk is full" if full else f"{type(error).__name__}: {error}")
+    else:
+        send.send(None)
+
+
+def _set_metadata(path: Path, **values: object) -> None:
+    metadata = artifacts.read_json(path)
+    metadata.update(values)
+    artifacts.write_json(path, metadata)
+
+
+def _publish(staging: Path, dataset_id: str, meant: Iterable[Mapping[str, NDArray[Any]]]) -> None:
+    """Compare a staged dataset with the arrays that were meant to be written, and write its manifest.
+
+    h5py drops the error of a write that fails while an array is closed, so only reading shows that all is there.
+    """
+    n_meant = 0
+    with h5py.File(staging / DATA_FILE, "r") as file:
+        for i, arrays in enumerate(meant):
+            n_meant += 1
+            for name, array in arrays.items():
+                stored = file.get(f"episode_{i}/{name}")
+                if stored is None or not np.array_equal(stored[()], array, equal_nan=True):
+                    raise ZestError(f"{name} of episode {i} of {dataset_id} was not written whole; is the disk full?")
+        if len(file) != n_meant:
+            raise ZestError(f"{len(file)} of {n_meant} episodes of {dataset_id} were written; try again")
+    files = [path for path in sorted(staging.rglob("*")) if path.is_file()]
+    digests = {path.relative_to(staging).as_posix(): artifacts.hash_file(path) for path in files}
+    artifacts.write_json(staging / MANIFEST_FILE, digests)
+
+
+def _stored(recording: Recording) -> dict[str, NDArray[Any]]:
+    """Return the arrays of one episode under the names that they have on disk."""
+    ends = np.zeros(len(recording.actions), dtype=bool)
+    ends[-1] = True
+    return {
+        "observations": recording.obs,
+        "actions": recording.actions,
+        "rewards": recording.gt_reward[1:],
+        "terminations": ends & recording.terminated,
+        "truncations": ends & (not recording.terminated),
+        "infos/state/qpos": recording.qpos,
+        "infos/state/qvel": recording.qvel,
+        "infos/gt/reward": recording.gt_reward,
+        "infos/gt/success": recording.gt_success,
+    }
+
+
+def _build_new(root: Path, dataset_id: str, recordings: Sequence[Recording], fields: Mapping[str, Any]) -> None:
+    os.environ["MINARI_DATASETS_PATH"] = str(root)  # of this child process only
+    import gymnasium
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    spec = gymnasium.envs.registration.EnvSpec.from_json(fields["env_spec"])
+    buffers = []
+    for i, recording in enumerate(recordings):
+        arrays = _stored(recording)
+        infos = {
+            "state": {key: arrays.pop(f"infos/state/{key}") for key in ("qpos", "qvel")},
+            "gt": {key: arrays.pop(f"infos/gt/{key}") for key in ("reward", "success")},
+        }
+        buffers.append(EpisodeBuffer(id=i, seed=recording.seed, infos=infos, **arrays))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Minari warns of every optional field that is not given
+        minari.create_dataset_from_buffers(
+            dataset_id,
+            buffers,
+            env=spec,
+            eval_env=spec,
+            ref_min_score=fields["ref_min_score"],
+            ref_max_score=fields["ref_max_score"],
+            algorithm_name=fields["algorithm_name"],
+            description=fields["description"],
+        )
+
+
+def write_dataset(
+    dataset_id: str,
+    recordings: Sequence[Recording],
+    *,
+    env_spec: str,
+    ref_min_score: float,
+    ref_max_score: float,
+    algorithm_name: str,
+    description: str,
+    zest: Mapping[str, Any],
+) -> Path:
+    """Write collected episodes as a new Minari dataset; rewards are the ground truth until it is relabeled.
+
+    Args:
+        dataset_id: ``namespace/name-vN``; must not exist.
+        recordings: the episodes.
+        env_spec: Gymnasium EnvSpec as JSON.
+        ref_min_score: ground-truth return of the robot doing nothing (0 on the normalized scale).
+        ref_max_score: mean ground-truth return of the expert (100 on the normalized scale).
+        algorithm_name: what acted.
+        description: one paragraph for readers.
+        zest: how the dataset was made; kept in the metadata.
+
+    Returns:
+        The dataset's folder.
+
+    Raises:
+        BadInput: bad id, no episodes, or a dataset of this id exists.
+        ZestError: the disk is full or read-only; nothing is left behind.
+    """
+    final = dataset_path(dataset_id)
+    if not recordings:
+        raise BadInput("a dataset must have at least 1 episode, got 0; collect some first")
+    fields = {
+        "env_spec": env_spec,
+        "ref_min_score": ref_min_score,
+        "ref_max_score": ref_max_score,
+        "algorithm_name": algorithm_name,
+        "description": description,
+    }
+    with artifacts.lock(final):
+        if exists(dataset_id):
+            raise BadInput(f"dataset {dataset_id} exists already; choose another name or delete {final}")
+        n_bytes = sum(r.obs.nbytes + r.actions.nbytes + r.qpos.nbytes + r.qvel.nbytes for r in recordings)
+        artifacts.check_free_space(final.parent, 2 * n_bytes)
+        with artifacts.staged_folder(final) as staging:
+            _in_child(_build_new, staging / "root", dataset_id, recordings, fields)
+            (staging / "root" / dataset_id / "data").rename(staging / "data")
+            shutil.rmtree(staging / "root")
+            _set_metadata(staging / METADATA_FILE, zest=dict(zest))
+            _publish(staging, dataset_id, [_stored(recording) for recording in recordings])
+    return final
+
+
+class Trajectories(Protocol):
+    """The episodes that get new rewards."""
+
+    @property
+    def dataset_id(self) -> str:
+        """The Minari id that they have, or would have."""
+
+    @property
+    def n_steps(self) -> Sequence[int]:
+        """T of every episode."""
+
+    @property
+    def n_bytes(self) -> int:
+        """About what `fill` writes."""
+
+    def fingerprint(self) -> str:
+        """64 hex digits over all that training may see of them, but no rewards."""
+
+    def source_rewards(self) -> Sequence[FloatArray | None]:
+        """Rewards (T,) of every episode to keep beside the new ones; None, or all NaN: there are none to keep."""
+
+    def fill(self, folder: Path) -> None:
+        """Leave a Minari dataset's `DATA_FILE` and `METADATA_FILE` in `folder`, never all episodes in memory.
+
+        Runs in a process of its own. Rewards that are not there to begin with are NaN.
+        """
+
+    def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
+        """Yield for every episode the arrays that `fill` must have left, by their names on disk."""
+
+
+@dataclass(frozen=True)
+class Copied:
+    """The `Trajectories` of a Minari dataset, copied as they are."""
+
+    dataset_id: str
+
+    @cached_property
+    def n_steps(self) -> Sequence[int]:
+        """T of every episode."""
+        return read_lengths(self.dataset_id)
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the HDF5 file."""
+        return (dataset_path(self.dataset_id) / DATA_FILE).stat().st_size
+
+    def fingerprint(self) -> str:
+        """See `zest_rl.data.reader.fingerprint`."""
+        return fingerprint(self.dataset_id)
+
+    def source_rewards(self) -> Sequence[FloatArray | None]:
+        """See `zest_rl.data.reader.rewards_to_keep`."""
+        return rewards_to_keep(self.dataset_id)
+
+    def fill(self, folder: Path) -> None:
+        """Copy the two files."""
+        (folder / "data").mkdir()
+        for name in (DATA_FILE, METADATA_FILE):
+            shutil.copyfile(dataset_path(self.dataset_id) / name, folder / name)
+
+    def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
+        """Nothing: a copy of a file that fails raises."""
+        return ({} for _ in self.n_steps)
+
+
+def _build_scored(trajectories: Trajectories, folder: Path, scored: Sequence[Mapping[str, FloatArray]]) -> None:
+    trajectories.fill(folder)
+    with h5py.File(folder / DATA_FILE, "r+") as file:
+        for i, arrays in enumerate(scored):
+            group = file[f"episode_{i}"]
+            if "infos/zest" in group:
+                del group["infos/zest"]
+            for name, array in arrays.items():
+                if name in group:
+                    del group[name]
+                group[name] = array
+
+
+def _scored(reward: FloatArray, score: FloatArray, source: FloatArray | None) -> dict[str, FloatArray]:
+    """Return what is new in an episode, under the names on disk."""
+    arrays = {"rewards": reward, "infos/zest/score": score}
+    if source is not None and not np.isnan(source).all():
+        arrays[SOURCE_REWARD] = np.concatenate([np.zeros(1, np.float32), source])
+    return arrays
+
+
+def write_relabeled(
+    source_id: str,
+    dataset_id: str,
+    rewards: Sequence[FloatArray],
+    scores: Sequence[FloatArray],
+    *,
+    description: str,
+    zest: Mapping[str, Any],
+    extra: Callable[[Path], None],
+) -> Path:
+    """Write a copy of a Minari dataset with other rewards: `write_scored` of its trajectories."""
+    read_metadata(source_id)  # its files are whole
+    return write_scored(Copied(source_id), dataset_id, rewards, scores, description=description, zest=zest, extra=extra)
+
+
+def write_scored(
+    trajectories: Trajectories,
+    dataset_id: str,
+    rewards: Sequence[FloatArray],
+    scores: Sequence[FloatArray],
+    *,
+    description: str,
+    zest: Mapping[str, Any],
+    extra: Callable[[Path], None],
+) -> Path:
+    """Write episodes with other rewards; everything else, ground truth included, stays bit for bit.
+
+    Rewards that are not the kitchen's ground truth are kept as ``infos/source/reward``.
+
+    Args:
+        trajectories: the episodes.
+        dataset_id: the new id; must not exist.
+        rewards: (T,) float32 per episode.
+        scores: (T+1,) float32 per episode, kept as ``infos/zest/score``.
+        description: appended to the source's description.
+        zest: provenance, kept in the metadata beside the source's own.
+        extra: called with the staged folder, to leave further files in it.
+
+    Returns:
+        The new dataset's folder.
+
+    Raises:
+        BadInput: the new id exists; lengths do not fit; a value is not finite.
+        ZestError: the disk is full or read-only; nothing is left behind.
+    """
+    final, n_steps = dataset_path(dataset_id), list(trajectories.n_steps)
+    if [len(r) for r in rewards] != n_steps or [len(s) for s in scores] != [n + 1 for n in n_steps]:
+        raise BadInput("rewards must have length T and scores length T+1 for every episode of the source dataset")
+    if not all(np.isfinite(array).all() for array in (*rewards, *scores)):
+        raise BadInput("rewards and scores must be finite, got NaN or infinity")
+    with artifacts.lock(final):
+        if exists(dataset_id):
+            raise BadInput(f"dataset {dataset_id} exists already; choose another name or delete {final}")
+        artifacts.check_free_space(final.parent, 2 * trajectories.n_bytes)
+        with artifacts.staged_folder(final) as staging:
+            scored = [_scored(*new) for new in zip(rewards, scores, trajectories.source_rewards(), strict=True)]
+            _in_child(_build_scored, trajectories, staging, scored)
+            metadata = artifacts.read_json(staging / METADATA_FILE)
+            _set_metadata(
+                staging / METADATA_FILE,
+                dataset_id=dataset_id,
+                description=f"{metadata.get('description', '')} {description}".strip(),
+                zest={**metadata.get("zest", {}), **zest},
+            )
+            extra(staging)
+            meant = ({**old, **new} for old, new in zip(trajectories.written(), scored, strict=True))
+            _publish(staging, dataset_id, meant)
+    return final

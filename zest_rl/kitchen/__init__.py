@@ -1,0 +1,1 @@
+"""One robot, six tasks: the environment, its experts, and how they are recorded."""

@@ -1,0 +1,1 @@
+"""Pure functions: statistics of returns, what a reward is worth, how well a selection finds its frames."""

@@ -1,0 +1,213 @@
+"""How much a reward is worth before anything is trained on it: pure functions of scores, states and ground truth.
+
+Ground truth is for judging a reward, never for making one; what needs none is marked so. Every figure comes with a 95 %
+bootstrap interval over episodes. A score here is that of the frames after each action, (T,) per episode: the rewards of
+an episode when these are levels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.errors import BadInput
+from zest_rl.metrics.statistics import Estimate, Values, over_episodes, paired
+from zest_rl.types import FloatArray
+
+SATURATED_BAND = 0.05
+"""Scores this near (as a share of their range) to the lowest or highest one count as saturated."""
+
+
+def _each_with(what: str, scores: Sequence[NDArray[np.generic]], others: Sequence[NDArray[np.generic]]) -> None:
+    if not scores:
+        raise BadInput("a reward can be judged on at least 1 episode, got 0; use a dataset with episodes")
+    for i, (score, other) in enumerate(zip(scores, others, strict=True)):
+        if score.ndim != 1 or len(score) == 0 or len(other) != len(score):
+            raise BadInput(
+                f"episode {i} must have (T >= 1,) scores and as many {what}, got {score.shape} and {len(other)}"
+            )
+
+
+def _mean_over_frames(shares: Values, scores: Sequence[NDArray[np.generic]]) -> Estimate:
+    """Average what was measured per episode (N,), each counting as many times as it has frames."""
+    lengths = np.array([len(score) for score in scores])
+    return over_episodes(lambda i: float(np.average(shares[i], weights=lengths[i])), len(scores))
+
+
+def returns_of(scores: Sequence[FloatArray]) -> Values:
+    """Sum of each episode's scores: (N,) float64."""
+    return np.array([score.sum(dtype=np.float64) for score in scores])
+
+
+def value_order(scores: Sequence[FloatArray]) -> Estimate:
+    """Value-order correlation: Spearman's ρ of score and time in an episode, averaged over episodes. No ground truth.
+
+    1 is a score that rises at every step (Ma et al. 2024, https://arxiv.org/abs/2411.04549). Episodes whose scores are
+    constant have no order and count as 0.
+    """
+    from scipy import stats
+
+    _each_with("scores", scores, scores)
+    orders = np.array(
+        [
+            0.0 if np.ptp(score) == 0 else float(stats.spearmanr(score, np.arange(len(score))).statistic)
+            for score in scores
+        ]
+    )
+    return over_episodes(lambda i: float(orders[i].mean()), len(orders))
+
+
+def share_told_by_step(scores: Sequence[FloatArray]) -> Estimate:
+    """Share of the scores' variance that the number of the step alone tells, in [0, 1]. No ground truth.
+
+    Near 1 the reward is a clock: whatever the robot does, the score at step t is the same. Each episode's scores are
+    told by the mean of the *other* episodes at the same step, against their mean over all steps: 1 − Σ squared error /
+    Σ squared distance, at least 0. NaN for constant scores, and for a single episode.
+    """
+    _each_with("scores", scores, scores)
+    length = max(map(len, scores))
+    padded = np.full((len(scores), length), np.nan)
+    for row, score in zip(padded, scores, strict=True):
+        row[: len(score)] = score
+    known = np.isfinite(padded)
+    filled = np.where(known, padded, 0.0)
+    others = known.sum(axis=0) - known  # how many other episodes have this step
+    by_step = np.divide(filled.sum(axis=0) - filled, others, out=np.zeros_like(filled), where=others > 0)
+    lengths = known.sum(axis=1)
+    by_all = (filled.sum() - filled.sum(axis=1)) / np.maximum(lengths.sum() - lengths, 1)
+    compared = known & (others > 0)
+    error = np.where(compared, (filled - by_step) ** 2, 0.0).sum(axis=1)
+    distance = np.where(compared, (filled - by_all[:, None]) ** 2, 0.0).sum(axis=1)
+
+    def share(i: NDArray[np.intp]) -> float:
+        if distance[i].sum() <= np.finfo(np.float32).eps ** 2 * (filled[i] ** 2).sum():
+            return float("nan")
+        return float(max(0.0, 1 - error[i].sum() / distance[i].sum()))
+
+    return over_episodes(share, len(scores))
+
+
+def straight_in_time(scores: Sequence[FloatArray]) -> Estimate:
+    """Share of an episode's variance that a straight line in time tells, averaged over episodes. No ground truth.
+
+    Pearson's ρ² of score and step. Episodes whose scores are constant, or that have one step, count as 0.
+    """
+    _each_with("scores", scores, scores)
+    shares = np.array(
+        [0.0 if np.ptp(score) == 0 else np.corrcoef(score, np.arange(len(score)))[0, 1] ** 2 for score in scores]
+    )
+    return over_episodes(lambda i: float(shares[i].mean()), len(shares))
+
+
+def share_saturated(scores: Sequence[FloatArray]) -> Estimate:
+    """Share of frames that score within `SATURATED_BAND` of the dataset's lowest or highest score. No ground truth.
+
+    NaN for constant scores.
+    """
+    _each_with("scores", scores, scores)
+    every = np.concatenate(scores)
+    low, high = float(every.min()), float(every.max())
+    if low == high:
+        return Estimate(float("nan"), float("nan"), float("nan"))
+    place = [(score - low) / (high - low) for score in scores]
+    shares = np.array([((p < SATURATED_BAND) | (p > 1 - SATURATED_BAND)).mean() for p in place])
+    return _mean_over_frames(shares, scores)
+
+
+def share_still(still: Sequence[NDArray[np.bool_]]) -> Estimate:
+    """Share of the frames after the first (T,) that show what the first one shows: nothing to be seen there yet.
+
+    Averaged over episodes. No ground truth.
+    """
+    shares = np.array([episode.mean() for episode in still])
+    return over_episodes(lambda i: float(shares[i].mean()), len(shares))
+
+
+def share_contradictory(scores: Sequence[FloatArray], states: Sequence[NDArray[np.float64]]) -> Estimate:
+    """Share of frames that score otherwise than an equal state (T, nq) of the same episode. No ground truth.
+
+    0 for any reward that is a function of what is seen now and at the start; scores of other episodes are not.
+    """
+    _each_with("states", scores, states)
+    shares = []
+    for score, episode in zip(scores, states, strict=True):
+        _, first, group = np.unique(episode, axis=0, return_index=True, return_inverse=True)
+        shares.append(float((score != score[first][group.reshape(-1)]).mean()))
+    return _mean_over_frames(np.array(shares), scores)
+
+
+def kendall(returns: Values, truth: Values) -> Estimate:
+    """Kendall's τ-b of two (N,) arrays; NaN where one of them is constant."""
+    from scipy import stats
+
+    a, b = paired(returns, truth)
+    return over_episodes(lambda i: float(stats.kendalltau(a[i], b[i]).statistic), len(a))
+
+
+def pairwise_accuracy(returns: Values, truth: Values) -> Estimate:
+    """Share of pairs of episodes that the returns order as the true returns (N,) do; .5 is chance.
+
+    Pairs with equal true returns are left out, equal returns count one half. NaN when all true returns are equal.
+    """
+    a, b = paired(returns, truth)
+    agree = (np.sign(a[:, None] - a) * np.sign(b[:, None] - b)).astype(np.int8)
+
+    def accuracy(i: NDArray[np.intp]) -> float:
+        chosen = agree[np.ix_(i, i)][b[i][:, None] != b[i]]
+        return float((1 + chosen.mean()) / 2) if len(chosen) else float("nan")
+
+    return over_episodes(accuracy, len(a))
+
+
+def average_precision(returns: Values, success: NDArray[np.bool_]) -> Estimate:
+    """Area under the precision-recall curve of telling successes (N,) bool by their return; chance is their share.
+
+    Σ over thresholds of (R_k − R_{k−1}) · P_k, equal returns at one threshold. NaN without a success.
+    """
+    returns, labels = np.asarray(returns, dtype=np.float64), np.asarray(success, dtype=bool)
+    if returns.shape != labels.shape or returns.ndim != 1 or len(returns) == 0:
+        raise BadInput(
+            f"returns and successes must be equally long lists of at least 1 value, got {returns.shape}, {labels.shape}"
+        )
+
+    def area(i: NDArray[np.intp]) -> float:
+        order = i[np.argsort(-returns[i], kind="stable")]
+        if not labels[i].any():
+            return float("nan")
+        last_of_equals = np.append(np.flatnonzero(np.diff(returns[order])), len(order) - 1)
+        hits = np.cumsum(labels[order])[last_of_equals]
+        return float((np.diff(hits, prepend=0) / hits[-1] * hits / (last_of_equals + 1)).sum())
+
+    return over_episodes(area, len(returns))
+
+
+def epic_distance(scores: Sequence[FloatArray], truth: Sequence[FloatArray]) -> Estimate:
+    """EPIC distance of two rewards on the dataset's transitions, in [0, 1]; 0: equal up to scale and offset.
+
+    √((1 − ρ) / 2), ρ Pearson's correlation over all transitions (Gleave et al. 2021, https://arxiv.org/abs/2006.13900).
+    Both rewards depend on the next state alone, which makes the canonical shaping of that paper a constant that the
+    correlation does not see. NaN where one reward is constant.
+
+    Args:
+        scores: (T,) per episode.
+        truth: (T,) per episode, the ground-truth rewards.
+    """
+    _each_with("ground-truth rewards", scores, truth)
+    every = [np.asarray(np.concatenate(rewards), dtype=np.float64) for rewards in (scores, truth)]
+    offsets, largest = [one.mean() for one in every], [np.abs(one).max() for one in every]
+    sums = np.empty((len(scores), 6))
+    for row, one, other in zip(sums, scores, truth, strict=True):
+        a, b = one - offsets[0], other - offsets[1]
+        row[:] = len(a), a.sum(), b.sum(), (a * a).sum(), (b * b).sum(), (a * b).sum()
+
+    def distance(i: NDArray[np.intp]) -> float:
+        n, a, b, aa, bb, ab = sums[i].sum(axis=0)
+        variances = np.array([aa / n - (a / n) ** 2, bb / n - (b / n) ** 2])
+        if (variances <= np.finfo(np.float32).eps ** 2 * np.square(largest)).any():
+            return float("nan")
+        rho = (ab / n - a * b / n**2) / np.sqrt(variances.prod())
+        return float(np.sqrt(np.clip((1 - rho) / 2, 0, 1)))
+
+    return over_episodes(distance, len(scores))

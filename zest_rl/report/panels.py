@@ -1,0 +1,102 @@
+"""Evaluations and relabeled datasets → what a report shows of them: goals, rankings, episodes with their videos."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.data import reader
+from zest_rl.data.images import list_images, read_image
+from zest_rl.evaluation.evaluate import Evaluation, evaluation_folder
+from zest_rl.kitchen.tasks import get_task
+from zest_rl.metrics import statistics
+from zest_rl.report import EpisodePanel, GoalPanel, Scatter
+from zest_rl.rewards.goals import read_goal, read_text
+from zest_rl.rewards.relabel import GOAL_FOLDER
+from zest_rl.rewards.scorer import Scorer
+from zest_rl.runtime import artifacts
+from zest_rl.simulation.videos import FPS, Film, Video, representative
+from zest_rl.types import FloatArray
+
+MIN_EPISODES_TO_RANK = 3
+
+
+def goal_scatter(name: str, dataset_id: str) -> Scatter:
+    """Return by a relabeled dataset's rewards against its ground-truth return, per episode."""
+    zest = np.array([episode.rewards.sum(dtype=np.float64) for episode in reader.read_episodes(dataset_id)])
+    truth = np.array([episode.episode_return for episode in reader.read_ground_truth(dataset_id)])
+    rho = statistics.Estimate(math.nan, math.nan, math.nan)
+    if len(zest) >= MIN_EPISODES_TO_RANK:
+        rho = statistics.spearman(zest, truth)
+    return Scatter(name, zest.astype(np.float32), truth.astype(np.float32), rho.value, (rho.low, rho.high))
+
+
+def goal_panel(name: str, dataset_id: str, scatter: Scatter | None = None) -> GoalPanel:
+    """The goal of a relabeled dataset, as pictures or sentences; how it ranks episodes, where that is known."""
+    made = reader.read_metadata(dataset_id)["zest"]["relabel"]
+    config = made["scorer"]["config"]
+    ranking = (None, 0) if scatter is None else (scatter.spearman, len(scatter.gt_returns))
+    folder = reader.dataset_path(dataset_id) / GOAL_FOLDER
+    if folder.is_dir():
+        start, goal = (tuple(read_image(path) for path in list_images(folder / part)) for part in ("init", "goal"))
+        return GoalPanel(name, start, goal, *ranking)
+    foreign = "views" not in config
+    sentences = read_text(config["goal"]) if foreign else read_goal(config["goal"], get_task(config["views"]["task"]))
+    kept = range(len(sentences.goals)) if made["kept_goals"] is None else made["kept_goals"]
+    return GoalPanel(name, sentences.starts, tuple(sentences.goals[k] for k in kept), *ranking)
+
+
+def episode_panels(name: str, evaluation: Evaluation, scorer: Scorer | None, film: Film) -> list[EpisodePanel]:
+    """Best, median and worst episode of an evaluation: video, score over time, ground-truth progress."""
+    panels = []
+    folder = evaluation_folder(evaluation.run, evaluation.config)
+    for which, index in representative(evaluation.normalized()).items():
+        states: NDArray[np.float64] = evaluation.traces["qpos"][index]
+        video = film(Video(states, folder / f"{which}.mp4"))
+        panel = _panel(f"{name}: {which}", name, evaluation, index, video)
+        panels.append(replace(panel, scores=None if scorer is None else scorer.score_episodes([states])[0][0]))
+    return panels
+
+
+def _panel(title: str, name: str, evaluation: Evaluation, index: int, video: Path) -> EpisodePanel:
+    return EpisodePanel(
+        title=title,
+        method=name,
+        seed=evaluation.episodes[index].seed,
+        normalized_return=float(evaluation.normalized()[index]),
+        success=evaluation.episodes[index].success,
+        video=video,
+        fps=FPS,
+        gt_progress=_progress(evaluation, index),
+    )
+
+
+def _progress(evaluation: Evaluation, index: int) -> FloatArray:
+    return np.asarray(evaluation.traces["gt_reward"][index], dtype=np.float32)
+
+
+def paired_panels(left: tuple[str, Evaluation], right: tuple[str, Evaluation], film: Film) -> list[EpisodePanel]:
+    """Two policies on the same start side by side: where the right one gains most, gains as it mostly does, and least.
+
+    Args:
+        left: name and evaluation of one policy.
+        right: of the other; without equal starts there is nothing to pair, and the list is empty.
+        film: makes the videos.
+    """
+    (left_name, one), (right_name, other) = left, right
+    if one.config.starts != other.config.starts:
+        return []
+    panels = []
+    before, after = one.normalized(), other.normalized()
+    for which, index in representative(after - before).items():
+        before_qpos, after_qpos = one.traces["qpos"][index], other.traces["qpos"][index]
+        name = f"pair-{artifacts.hash_arrays(before_qpos, after_qpos)[:8]}.mp4"
+        video = film(Video(before_qpos, evaluation_folder(other.run, other.config) / name, beside=after_qpos))
+        title = f"{left_name} (left, {before[index]:.0f} %) beside {right_name} (right): {which} gain"
+        panel = _panel(title, right_name, other, index, video)
+        panels.append(replace(panel, beside=(left_name, _progress(one, index))))
+    return panels

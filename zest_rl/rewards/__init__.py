@@ -1,0 +1,1 @@
+"""Goal + embedder → scores → a relabeled dataset."""

@@ -1,0 +1,196 @@
+"""Goal specs: pictures or sentences of the start and the goal state, read and validated.
+
+A spec is one string:
+
+- ``same-scene``: the scene itself, rendered before and after; each camera view gets its own pair;
+- ``drawings``: the small drawings that come with the package;
+- a folder with ``init/`` and ``goal/``, each holding one or more pictures;
+- ``visual-tasks:real_imgs`` or ``visual-tasks:drawings``: the task's folder in the paper's Visual Tasks Dataset, which
+  the environment variable ZEST_VISUAL_TASKS points to;
+- ``text:closed microwave -> open microwave`` (several sentences are separated by ``|``);
+- ``text``: the task's own two sentences.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.data.images import list_images, read_image
+from zest_rl.errors import BadInput
+from zest_rl.kitchen.tasks import Task
+from zest_rl.runtime import artifacts
+from zest_rl.types import Frame
+
+SAME_SCENE, DRAWINGS, VISUAL_TASKS, OWN_TEXT, TEXT = "same-scene", "drawings", "visual-tasks:", "text", "text:"
+VISUAL_TASKS_VARIABLE = "ZEST_VISUAL_TASKS"
+
+
+@dataclass(frozen=True)
+class GoalSpec:
+    """Start and goal states as pictures or as sentences, one or several of each."""
+
+    name: str
+    """The spec as it was written."""
+    starts: tuple[Frame, ...] | tuple[str, ...]
+    goals: tuple[Frame, ...] | tuple[str, ...]
+    per_view: bool = False
+    """Picture v belongs to camera view v alone (same-scene goals)."""
+
+    def __post_init__(self) -> None:
+        if not self.starts or not self.goals:
+            raise BadInput(
+                f"goal spec {self.name!r} needs at least 1 start and 1 goal, "
+                f"got {len(self.starts)} and {len(self.goals)}"
+            )
+
+    @property
+    def is_text(self) -> bool:
+        """Sentences rather than pictures."""
+        return isinstance(self.goals[0], str)
+
+    def fingerprint(self) -> str:
+        """Hash of the content, whatever it was called."""
+        parts = [
+            [item if isinstance(item, str) else artifacts.hash_arrays(item) for item in items]
+            for items in (self.starts, self.goals)
+        ]
+        return artifacts.hash_json([*parts, self.per_view])
+
+
+def read_folder(folder: Path, name: str | None = None) -> GoalSpec:
+    """Read a folder with ``init/`` and ``goal/``.
+
+    Raises:
+        BadInput: a folder is missing or empty, or a picture cannot be read.
+    """
+    for part in ("init", "goal"):
+        if not (folder / part).is_dir():
+            found = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else None
+            raise BadInput(
+                f"a goal folder must hold init/ (pictures of the start) and goal/ (pictures of the goal); {folder} "
+                + (
+                    "is not a folder"
+                    if found is None
+                    else f"has no {part}/, it holds {', '.join(found[:8]) or 'nothing'}"
+                )
+            )
+    starts, goals = (tuple(read_image(p) for p in list_images(folder / part)) for part in ("init", "goal"))
+    return GoalSpec(name or str(folder), starts, goals)
+
+
+def read_text(spec: str) -> GoalSpec:
+    """Parse ``text:START -> GOAL``.
+
+    Raises:
+        BadInput: there are not two sides.
+    """
+    sides = [side.strip() for side in spec.removeprefix(TEXT).split("->")]
+    if len(sides) != 2 or not all(sides):
+        raise BadInput(f"a text goal must look like 'text:closed microwave -> open microwave', got {spec!r}")
+    starts, goals = (tuple(s.strip() for s in side.split("|") if s.strip()) for side in sides)
+    return GoalSpec(spec, starts, goals)
+
+
+def goal_folder(spec: str, task: Task) -> Path | None:
+    """Return the folder with the pictures that a spec names; None for sentences and the scene itself.
+
+    Raises:
+        BadInput: there is no such folder, or the spec is none of the kinds.
+    """
+    if spec in (SAME_SCENE, OWN_TEXT) or spec.startswith(TEXT):
+        return None
+    if spec == DRAWINGS:
+        return _drawings(task)
+    if spec.startswith(VISUAL_TASKS):
+        return _visual_tasks(spec, task)
+    folder = Path(spec).expanduser()
+    if not folder.exists():
+        raise BadInput(
+            f"unknown goal {spec!r}: it is neither {SAME_SCENE!r}, {DRAWINGS!r}, '{VISUAL_TASKS}real_imgs', "
+            "'text', 'text:START -> GOAL', nor an existing folder with init/ and goal/"
+        )
+    return folder
+
+
+def _drawings(task: Task) -> Path:
+    folder = artifacts.shipped("datasets") / "goals" / task.name
+    if not folder.is_dir():
+        drawn = sorted(p.name for p in folder.parent.iterdir() if p.is_dir()) if folder.parent.is_dir() else []
+        raise BadInput(
+            f"there are no drawings of task {task.name!r} (only of {', '.join(drawn) or 'none'}); "
+            "give a folder with init/ and goal/ instead"
+        )
+    return folder
+
+
+def _visual_tasks(spec: str, task: Task) -> Path:
+    root = os.environ.get(VISUAL_TASKS_VARIABLE)
+    if not root:
+        raise BadInput(
+            f"goal {spec!r} needs the environment variable {VISUAL_TASKS_VARIABLE}: set it to your copy of the Visual "
+            "Tasks Dataset (the folder that holds real_imgs/ and drawings/)"
+        )
+    return Path(root) / spec.removeprefix(VISUAL_TASKS) / task.goal_folder
+
+
+def read_goal(spec: str, task: Task, scene: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None = None) -> GoalSpec:
+    """Read a goal spec of any kind.
+
+    Args:
+        spec: see the module's docstring.
+        task: for specs that are different things for each task.
+        scene: (V, H, W, 3) start and goal frames of the scene itself, needed for ``same-scene``.
+
+    Raises:
+        BadInput: the spec is none of the kinds, or what it names cannot be read.
+    """
+    if spec == SAME_SCENE:
+        if scene is None:
+            raise BadInput(f"goal {SAME_SCENE!r} needs frames of the scene")
+        return GoalSpec(spec, tuple(scene[0]), tuple(scene[1]), per_view=True)
+    if spec == OWN_TEXT:
+        return GoalSpec(spec, (task.start_text,), (task.goal_text,))
+    folder = goal_folder(spec, task)
+    return read_text(spec) if folder is None else read_folder(folder, spec)
+
+
+def read_free_goal(spec: str) -> GoalSpec:
+    """Read a goal spec that needs no task: a folder, or two sentences.
+
+    Raises:
+        BadInput: the spec is one of those of the kitchen, or what it names cannot be read.
+    """
+    if spec.startswith(TEXT):
+        return read_text(spec)
+    folder = Path(spec).expanduser()
+    if spec in (SAME_SCENE, DRAWINGS, OWN_TEXT) or spec.startswith(VISUAL_TASKS) or not folder.exists():
+        kitchen = f"{SAME_SCENE!r}, {DRAWINGS!r}, 'text' and '{VISUAL_TASKS}…' are of zest/Kitchen-v1's tasks alone"
+        raise BadInput(
+            f"frames from elsewhere need a goal of their own, got {spec!r} ({kitchen}); give --goal a folder with "
+            "init/ and goal/ pictures, or 'text:closed drawer -> open drawer'"
+        )
+    return read_folder(folder)
+
+
+def embed_goal(goal: GoalSpec, embedder: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Embed the starts and the goals of a spec.
+
+    Args:
+        goal: S starts and K goals.
+        embedder: a `zest_rl.embedders.Embedder`.
+
+    Returns:
+        (S, D) and (K, D) float32; (V, 1, D) each for a spec that gives each of V views its own pair.
+
+    Raises:
+        BadInput: sentences were given to an embedder that reads pictures only.
+    """
+    embed = embedder.embed_texts if goal.is_text else embedder.embed_images
+    starts, goals = embed(goal.starts), embed(goal.goals)
+    return (starts[:, None], goals[:, None]) if goal.per_view else (starts, goals)

@@ -1,0 +1,207 @@
+"""Simulator states → embeddings of all views, each distinct state rendered and embedded once, cached by content.
+
+The cache is a folder of shards ``keys (n, nq) float64, embeddings (n, V, D) float32``; its name hashes everything that
+an embedding depends on. Any process may add shards, each is written atomically, none is ever changed.
+
+One state is one batch of V frames on one thread, so that an embedding is the same number whichever states were
+embedded beside it: networks are exact only up to about 1e-6 across batch sizes and thread counts.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.embedders import Embedder, Precision, load_embedder
+from zest_rl.errors import BadInput, ZestError
+from zest_rl.runtime import artifacts
+from zest_rl.runtime.parallel import (
+    Engine,
+    chunks,
+    counted,
+    map_jobs,
+    one_thread,
+    read_array,
+    write_arrays,
+)
+from zest_rl.simulation.views import Views, canonical_states, distinct_states, state_keys
+from zest_rl.types import FloatArray
+
+STATES_PER_SHARD = 32
+SHARDS_IN_MEMORY = 64
+"""Of 1.3 MB each with 8 views and the default embedder."""
+
+
+@dataclass(frozen=True)
+class EmbedConfig:
+    """What turns a state into embeddings."""
+
+    views: Views
+    embedder: str
+    """Embedder URI, see `zest_rl.embedders`."""
+    precision: Precision = "auto"
+    device: str = "auto"
+
+    def load_embedder(self) -> Embedder:
+        """Return the embedder, shared within the process; the default's network is loaded at its first picture."""
+        return shared_embedder(self.embedder, self.precision, self.device)
+
+
+@functools.lru_cache(maxsize=2)
+def shared_embedder(uri: str, precision: Precision, device: str) -> Embedder:
+    """Return this process's embedder of a URI, see `load_embedder`."""
+    return load_embedder(uri, device=device, precision=precision)
+
+
+def check_same_embedder(embedder: Embedder, fingerprint: str) -> None:
+    """Make sure that a worker's embedder is that of the process that asked: the cache goes by the latter.
+
+    Raises:
+        BadInput: weights, precision or versions differ between the machines.
+    """
+    if embedder.fingerprint != fingerprint:
+        raise BadInput(
+            f"embedder {embedder.uri} of this worker is not that of the process that asked: weights, precision or "
+            "versions differ; install the same on every node, and choose --precision fp32 or bf16"
+        )
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Some states to embed."""
+
+    config: EmbedConfig
+    states: NDArray[np.float64]
+    fingerprint: str
+    """Of the embedder."""
+
+
+def _embed_states(job: _Job) -> dict[str, NDArray[np.generic]]:
+    renderer, embedder = job.config.views.shared_renderer(), job.config.load_embedder()
+    check_same_embedder(embedder, job.fingerprint)
+    with one_thread():
+        embeddings = [embedder.embed_images(list(renderer.render(state))) for state in job.states]
+    return {"keys": job.states, "embeddings": np.stack(embeddings)}
+
+
+@functools.lru_cache(maxsize=SHARDS_IN_MEMORY)
+def _read_shard(path: Path) -> FloatArray | None:
+    """Return the embeddings of a shard, which never changes; None when it is missing or damaged."""
+    return read_array(path, "embeddings")
+
+
+class StateEmbedder:
+    """Embeds simulator states through a cache on disk."""
+
+    def __init__(self, config: EmbedConfig, *, n_workers: int | None = None, engine: Engine = "local") -> None:
+        """Open the cache of `config` (created when something is first written)."""
+        self.config = config
+        self.n_workers, self.engine = n_workers, engine
+        self.embedder = config.load_embedder()
+        self.n_embedded = 0
+        """States that were not in the cache and had to be rendered and embedded."""
+        digest = artifacts.hash_json([config.views.fingerprint(), self.embedder.fingerprint])
+        self.folder: Path = artifacts.cache_dir() / "embeddings" / digest[:20]
+        self._where: dict[bytes, tuple[Path, int]] = {}
+        """State → its shard, and the row in it."""
+        self._new: dict[bytes, FloatArray] = {}
+        """What `embed_now` computed and no shard holds yet."""
+        self._read: set[Path] = set()
+        self._find()
+
+    def _find(self) -> None:
+        """Learn which states the shards hold that came since; a damaged one is as good as none."""
+        for path in sorted(self.folder.glob("*.npz")):
+            if path not in self._read and (keys := read_array(path, "keys")) is not None:
+                self._where.update((key, (path, row)) for row, key in enumerate(state_keys(keys)))
+                self._read.add(path)
+
+    def embed(self, qpos: NDArray[np.float64], on_progress: Callable[[int, int], None] | None = None) -> None:
+        """Leave the embeddings of states in the cache, all cores at work on those that are not there.
+
+        Args:
+            qpos: (N, nq) simulator positions.
+            on_progress: called with (shards done, shards in all).
+        """
+        states = distinct_states(qpos, self.config.views)  # as the episodes meet them: an episode needs few shards
+        missing = states[[key not in self._where for key in state_keys(states)]]
+        if len(missing) == 0:
+            return
+        jobs = {}
+        for chunk in chunks(len(missing), STATES_PER_SHARD):
+            part = missing[chunk.start : chunk.stop]
+            jobs[artifacts.hash_arrays(part)[:20]] = _Job(self.config, part, self.embedder.fingerprint)
+        map_jobs(
+            _embed_states,
+            jobs,
+            self.folder,
+            n_workers=self.n_workers,
+            engine=self.engine,
+            device=self.config.device,
+            on_done=counted(on_progress, len(jobs)),
+        )
+        self.n_embedded += len(missing)
+        self._find()
+
+    def embedded(self, qpos: NDArray[np.float64]) -> tuple[FloatArray, NDArray[np.intp]]:
+        """Read what `embed` left; a few shards are in memory at a time.
+
+        Args:
+            qpos: (N, nq) simulator positions, such as those of an episode.
+
+        Returns:
+            (U, V, D) float32 embeddings of the U distinct states, and (N,) the index of each state among them.
+
+        Raises:
+            ZestError: a file of the cache is damaged.
+        """
+        states, inverse = np.unique(canonical_states(qpos, self.config.views), axis=0, return_inverse=True)
+        rows = []
+        for key in state_keys(states):
+            if (row := self._row(key)) is None:
+                raise ZestError(f"embeddings in {self.folder} are missing or damaged; run the same command again")
+            rows.append(row)
+        return np.stack(rows), np.asarray(inverse).reshape(-1)
+
+    def _row(self, key: bytes) -> FloatArray | None:
+        """Return the (V, D) embeddings of a state, or None; a damaged shard is removed and forgotten."""
+        if key in self._new:
+            return self._new[key]
+        if key not in self._where:
+            return None
+        path, row = self._where[key]
+        if (embeddings := _read_shard(path)) is not None:
+            found: FloatArray = embeddings[row]
+            return found
+        path.unlink(missing_ok=True)
+        _read_shard.cache_clear()
+        self._read.discard(path)
+        self._where = {other: place for other, place in self._where.items() if place[0] != path}
+        return None
+
+    def embed_now(self, qpos: NDArray[np.float64]) -> FloatArray:
+        """Embed states in this process, for use within a rollout: (N, nq) → (N, V, D). Call `flush` at the end."""
+        states = canonical_states(qpos, self.config.views)
+        rows = []
+        for state, key in zip(states, state_keys(states), strict=True):
+            if (row := self._row(key)) is None:
+                job = _Job(self.config, state[None], self.embedder.fingerprint)
+                self._new[key] = row = np.asarray(_embed_states(job)["embeddings"][0], np.float32)
+                self.n_embedded += 1
+            rows.append(row)
+        return np.stack(rows)
+
+    def flush(self) -> None:
+        """Leave what `embed_now` computed in the cache."""
+        keys, rows = list(self._new), list(self._new.values())
+        for part in chunks(len(keys), STATES_PER_SHARD):
+            states = np.stack([np.frombuffer(key) for key in keys[part.start : part.stop]])
+            path = self.folder / f"{artifacts.hash_arrays(states)[:20]}.npz"
+            write_arrays(path, {"keys": states, "embeddings": np.stack(rows[part.start : part.stop])})
+        self._new.clear()
+        self._find()

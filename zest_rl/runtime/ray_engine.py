@@ -1,0 +1,144 @@
+"""Jobs on a Ray cluster: the other engine of `zest_rl.runtime.parallel.map_jobs`. Needs the extra ``ray``.
+
+Each worker is a Ray actor: a process with a core, and a GPU of its own, for as long as there is work. Ray starts one
+that died anew and repeats its job. Results come back to the process that asked, which alone writes them. Ray Data, made
+for tables, takes twice as long to start and hands back the same arrays.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import socket
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, TypeVar
+
+from numpy.typing import NDArray
+
+from zest_rl.errors import BadInput, ZestError
+
+Job = TypeVar("Job")
+Arrays = Mapping[str, NDArray[Any]]
+MAX_RETRIES = 3
+"""How often a job is begun again whose worker died."""
+HANDED_ON = ("ZEST_", "MINARI_", "HF_", "TORCH_HOME", "MUJOCO_GL")
+"""Beginnings of the environment variables that workers get."""
+
+
+class _Worker:
+    """What an actor runs."""
+
+    def __init__(self, work: Callable[[Any], Arrays], folder: str) -> None:
+        self._work = work
+        with suppress(FileNotFoundError):  # so that relative paths mean the same, where this node has the folder
+            os.chdir(folder)
+
+    def start(self) -> None:
+        """Return when the actor is there."""
+
+    def do(self, job: Any) -> Arrays | Exception:
+        """Do a job; a refusal is a result too, so that Ray does not wrap it."""
+        try:
+            return dict(self._work(job))
+        except Exception as error:
+            return error
+
+
+def run_jobs(
+    work: Callable[[Job], Arrays], jobs: Mapping[str, Job], *, n_workers: int | None = None, device: str = "cpu"
+) -> Generator[tuple[str, Arrays], None, None]:
+    """Yield the name and the arrays of ``work(job)`` for every job, the first that is done first.
+
+    The cluster is that of ``RAY_ADDRESS``, or of the caller's own ``ray.init``; else one is started on this machine for
+    the time of the work.
+
+    Args:
+        work: a module-level function, or a partial of one.
+        jobs: name → job, both picklable.
+        n_workers: workers at most; default one per GPU, or per core where there are none.
+        device: what the work runs on; unless it is ``cpu``, each worker gets a GPU of its own where there are any.
+
+    Raises:
+        BadInput: Ray is not installed, or the device is not one that its workers have.
+        ZestError: the cluster cannot be joined, or a job's worker died again and again.
+    """
+    if importlib.util.find_spec("ray") is None:
+        raise BadInput("engine 'ray' needs Ray: pip install 'zest-rl[ray]', or use engine 'local'")
+    if ":" in device:
+        raise BadInput(
+            f"on Ray each worker has one GPU, which it calls cuda, got device {device!r}; use cuda, cpu or auto"
+        )
+    if not jobs:
+        return
+    import ray
+    from ray.exceptions import RayError
+
+    with _cluster(n_workers):
+        there = ray.cluster_resources()  # type: ignore[no-untyped-call]
+        n_gpus = 0 if device == "cpu" else int(there.get("GPU", 0))
+        if device == "cuda" and n_gpus == 0:
+            raise BadInput("device 'cuda' is not there: the Ray cluster has no GPU; use cpu or auto")
+        most = n_gpus or int(there.get("CPU", 1))
+        as_actor = ray.remote(num_cpus=1, num_gpus=min(n_gpus, 1), max_restarts=-1, max_task_retries=MAX_RETRIES)
+        actor_class: Any = as_actor(_Worker)
+        actors = [actor_class.remote(work, str(Path.cwd())) for _ in range(min(n_workers or most, most, len(jobs)))]
+        todo = iter(jobs)
+        busy: dict[Any, tuple[Any, str | None]] = {actor.start.remote(): (actor, None) for actor in actors}
+        try:
+            while busy:
+                (done, *_), _ = ray.wait(list(busy), num_returns=1)
+                actor, finished = busy.pop(done)
+                result = ray.get(done)
+                if (name := next(todo, None)) is not None:
+                    busy[actor.do.remote(jobs[name])] = (actor, name)
+                if isinstance(result, Exception):
+                    raise result
+                if finished is not None:
+                    yield finished, result
+        except RayError as error:
+            raise ZestError(
+                f"Ray could not finish the work ({type(error).__name__}: {error}); finished parts are kept, run the "
+                "same command again to go on"
+            ) from error
+        finally:
+            for actor in actors:
+                ray.kill(actor)
+
+
+@contextmanager
+def _cluster(n_workers: int | None) -> Iterator[None]:
+    """Join a cluster, or start one on this machine for as long as the context is open."""
+    import ray
+
+    if ray.is_initialized():
+        yield
+        return
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers otherwise
+    settings = {name: value for name, value in os.environ.items() if name.startswith(HANDED_ON)}
+    options: dict[str, Any] = {"runtime_env": {"env_vars": settings}, "log_to_driver": False, "logging_level": "error"}
+    if address := os.environ.get("RAY_ADDRESS"):
+        _join(address, options)
+    else:
+        os.environ.setdefault("RAY_worker_niceness", "0")  # as the local engine's processes; Ray's default is 15
+        ray.init(address="local", num_cpus=n_workers, include_dashboard=False, **options)
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _join(address: str, options: Mapping[str, Any]) -> None:
+    import ray
+
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    try:
+        if port.isdecimal():  # where nothing answers, Ray itself would try for minutes
+            socket.create_connection((host, int(port)), timeout=10).close()
+        ray.init(address=address, **options)
+    except (OSError, RuntimeError, ValueError) as error:  # a ConnectionError is an OSError
+        raise ZestError(
+            f"the Ray cluster at RAY_ADDRESS={address} cannot be joined ({error}); run the command on one of its nodes "
+            "with the same version of Ray, or unset the variable to start a cluster on this machine"
+        ) from error

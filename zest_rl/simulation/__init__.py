@@ -1,0 +1,1 @@
+"""MuJoCo models: state → frames, fast and deterministic."""

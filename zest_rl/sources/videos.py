@@ -1,0 +1,102 @@
+"""Frames in a folder beside a dataset: ``episode_0.mp4``, or ``episode_0/`` with pictures, one for each episode.
+
+One folder is one view. Frame t shows x_t: T + 1 frames for T actions, or T where the last one was not recorded.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from zest_rl.analysis.clip_selection import VIDEO_SUFFIXES, by_number, decoded
+from zest_rl.data.images import list_images, read_image
+from zest_rl.errors import BadInput
+from zest_rl.runtime import artifacts
+from zest_rl.types import Frame
+
+_NAME = re.compile(r"episode_0*(\d+)")
+
+
+@dataclass(frozen=True)
+class Clips:
+    """`Frames` of videos or folders of pictures."""
+
+    paths: tuple[tuple[Path, ...], ...]
+    """Per view, per episode."""
+
+    @property
+    def views(self) -> Sequence[str]:
+        """Names of the folders."""
+        return [paths[0].parent.name for paths in self.paths]
+
+    def describe(self) -> dict[str, Any]:
+        """Tell which folders the frames are from, and how they align."""
+        return {
+            "kind": "clips",
+            "views": list(self.views),
+            "alignment": "frame t is x_t; of T, x_T repeats the last",
+        }
+
+    def digest(self, episode: int) -> str:
+        """Hash the files."""
+        return artifacts.hash_json([[artifacts.hash_file(file) for file in _files(of[episode])] for of in self.paths])
+
+    def read(self, episode: int) -> Iterator[Sequence[Frame]]:
+        """Decode the views side by side."""
+        paths = [of[episode] for of in self.paths]
+        try:
+            yield from zip(*map(_decode, paths), strict=True)
+        except ValueError as error:
+            if isinstance(error, BadInput):
+                raise
+            raise BadInput(f"the views of an episode must be equally long: {', '.join(map(str, paths))}") from error
+
+
+def _files(path: Path) -> list[Path]:
+    return sorted(list_images(path), key=by_number) if path.is_dir() else [path]
+
+
+def _decode(path: Path) -> Iterator[Frame]:
+    if path.is_dir():
+        yield from map(read_image, _files(path))
+        return
+    try:
+        yield from decoded(path)
+    except (OSError, RuntimeError, IndexError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise BadInput(f"{path} cannot be read as a video ({reason}); copy it, or convert it to MP4") from error
+
+
+def find_clips(folders: Sequence[Path], n_episodes: int, what: str) -> Clips:
+    """Find the clip of every episode in each folder.
+
+    Args:
+        folders: one per view.
+        n_episodes: of the dataset.
+        what: names the dataset in an error.
+
+    Raises:
+        BadInput: a clip is missing, is there twice, or is of no episode.
+    """
+    paths = []
+    for folder in folders:
+        found: dict[int, Path] = {}
+        for path in sorted(folder.iterdir()):
+            name = _NAME.fullmatch(path.name if path.is_dir() else path.stem)
+            if name is None or not (path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES):
+                continue
+            if (number := int(name[1])) in found:
+                raise BadInput(f"{path} and {found[number].name} are both of episode {number}; remove one")
+            found[number] = path
+        missing = [number for number in range(n_episodes) if number not in found]
+        if missing or len(found) > n_episodes:
+            raise BadInput(
+                f"{folder} must hold episode_0.mp4 (or a folder episode_0 of pictures) and so on, one for each of the "
+                f"{n_episodes} episodes of {what}; "
+                + (f"{len(missing)} are missing, the first is {missing[0]}" if missing else f"got {len(found)}")
+            )
+        paths.append(tuple(found[number] for number in range(n_episodes)))
+    return Clips(tuple(paths))

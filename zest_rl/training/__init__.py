@@ -1,0 +1,1 @@
+"""Episodes → a run folder with a policy."""

@@ -1,0 +1,150 @@
+"""All that changes while a policy is trained, and how it survives a cut: ``checkpoints/update-N`` of a run folder."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import safetensors.torch
+import torch
+from torch import Tensor, nn
+
+from zest_rl.errors import ZestError
+from zest_rl.runtime import artifacts
+
+N_CHECKPOINTS = 2
+
+
+@dataclass
+class TrainState:
+    """What a checkpoint holds, with torch's random generators."""
+
+    model: nn.Module
+    optimizer: torch.optim.Optimizer
+    rng: np.random.Generator
+    average: dict[str, Tensor]
+    """Exponential moving average of `params`: the weights that a policy acts with."""
+    update: int = 0
+    recent: list[tuple[float, float]] = field(default_factory=list)
+    """(loss, gradient norm) since the last logged row."""
+    seconds: float = 0.0
+
+    @classmethod
+    def start(cls, model: nn.Module, weight_decay: float, seed: int) -> TrainState:
+        """Return the state before the first update; AdamW trains what requires a gradient."""
+        trained = {name: p for name, p in model.named_parameters() if p.requires_grad}
+        optimizer = torch.optim.AdamW(trained.values(), weight_decay=weight_decay, fused=True)
+        average = {name: p.detach().clone() for name, p in trained.items()}
+        return cls(model.train(), optimizer, np.random.default_rng(seed), average)
+
+    @property
+    def params(self) -> dict[str, nn.Parameter]:
+        """Trained parameters by name, in the optimizer's order."""
+        return {name: p for name, p in self.model.named_parameters() if p.requires_grad}
+
+    def follow(self, params: list[nn.Parameter], decay: float) -> None:
+        """Move the average towards `params`; while there were few updates, the decay is (1 + n) / (10 + n) at most.
+
+        That is the rule of TensorFlow's ``ExponentialMovingAverage``.
+        """
+        decay = min(decay, (1 + self.update) / (10 + self.update))
+        with torch.no_grad():
+            for mean, parameter in zip(self.average.values(), params, strict=True):
+                mean.lerp_(parameter, 1 - decay)
+
+    def averaged_weights(self) -> dict[str, Tensor]:
+        """Return the model's state dict on the CPU, with the average in the place of what was trained."""
+        return {name: tensor.cpu() for name, tensor in (self.model.state_dict() | self.average).items()}
+
+
+def save_checkpoint(run_dir: Path, state: TrainState) -> None:
+    """Write the state under ``checkpoints/update-N`` and remove all but the newest `N_CHECKPOINTS`."""
+    folder = run_dir / "checkpoints" / f"update-{state.update:09d}"
+    moments = {
+        f"{name}/{key}": tensor
+        for name, parameter in state.params.items()
+        for key, tensor in state.optimizer.state[parameter].items()
+    }
+    generators = {"cpu": torch.get_rng_state()}
+    cuda = next(state.model.parameters()).device
+    if cuda.type == "cuda":
+        generators["cuda"] = torch.cuda.get_rng_state(cuda)
+    weights = state.model.state_dict()
+    parts = {"model": weights, "optimizer": moments, "average": state.average, "generators": generators}
+    artifacts.check_free_space(run_dir, sum(t.nbytes for tensors in parts.values() for t in tensors.values()))
+    with artifacts.staged_folder(folder) as staging:
+        for name, tensors in parts.items():
+            safetensors.torch.save_file(tensors, staging / f"{name}.safetensors")
+        progress = {
+            "update": state.update,
+            "seconds": state.seconds,
+            "recent": state.recent,
+            "sampler": state.rng.bit_generator.state,
+        }
+        artifacts.write_json(staging / "state.json", progress)
+        manifest = {path.name: artifacts.hash_file(path) for path in sorted(staging.iterdir())}
+        artifacts.write_json(staging / "manifest.json", manifest)
+    for old in _checkpoints(run_dir)[:-N_CHECKPOINTS]:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _checkpoints(run_dir: Path) -> list[Path]:
+    return sorted((run_dir / "checkpoints").glob("update-*"))
+
+
+def snapshot_folder(run_dir: Path, update: int) -> Path:
+    """Where the policy after so many updates is kept, if it is."""
+    return run_dir / "snapshots" / f"update-{update:09d}"
+
+
+def snapshots(run_dir: Path) -> list[Path]:
+    """Folders of the policies that a training kept on its way, the earliest first."""
+    return sorted((run_dir / "snapshots").glob("update-*"))
+
+
+def resume(run_dir: Path, state: TrainState) -> None:
+    """Bring `state` and torch's generators to the newest checkpoint, if there is one.
+
+    Raises:
+        ZestError: the checkpoint is damaged.
+    """
+    folders = _checkpoints(run_dir)
+    if not folders:
+        return
+    folder = folders[-1]
+    _verify(folder)
+    tensors = {
+        name: safetensors.torch.load_file(folder / f"{name}.safetensors")
+        for name in ("model", "optimizer", "average", "generators")
+    }
+    state.model.load_state_dict(tensors["model"])
+    for name, mean in state.average.items():
+        mean.copy_(tensors["average"][name])
+    moments: dict[int, dict[str, Tensor]] = {i: {} for i in range(len(state.params))}
+    places = {name: i for i, name in enumerate(state.params)}
+    for full_name, tensor in tensors["optimizer"].items():
+        name, _, key = full_name.rpartition("/")
+        moments[places[name]][key] = tensor.clone()
+    state.optimizer.load_state_dict({"state": moments, "param_groups": state.optimizer.state_dict()["param_groups"]})
+    torch.set_rng_state(tensors["generators"]["cpu"])
+    if "cuda" in tensors["generators"]:
+        torch.cuda.set_rng_state(tensors["generators"]["cuda"], next(state.model.parameters()).device)
+    progress = artifacts.read_json(folder / "state.json")
+    state.update, state.seconds = progress["update"], progress["seconds"]
+    state.recent = [(loss, norm) for loss, norm in progress["recent"]]
+    state.rng.bit_generator.state = progress["sampler"]
+
+
+def _verify(folder: Path) -> None:
+    try:
+        manifest: dict[str, str] = artifacts.read_json(folder / "manifest.json")
+        bad = [name for name, sha256 in manifest.items() if artifacts.hash_file(folder / name) != sha256]
+    except (ZestError, OSError, AttributeError):
+        bad = ["manifest.json"]
+    if bad:
+        raise ZestError(
+            f"checkpoint {folder} is damaged: {', '.join(bad)} is not what was written; delete this folder and start "
+            "the run again, which then goes on from the checkpoint before it"
+        )
