@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import imageio.v2 as imageio
-import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
@@ -26,9 +24,9 @@ from zest_rl.analysis.clip_selection import (
     embed_clips,
     enough,
     folder_of_clips,
-    read_clip,
     something_something,
 )
+from zest_rl.data.video import read_frames
 from zest_rl.embedders import load_embedder
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.env import KitchenEnv
@@ -76,25 +74,11 @@ def root(openings: dict[str, list[list[np.ndarray]]], tmp_path: Path, monkeypatc
     return root
 
 
-def test_a_video_is_read_from_its_first_frame_to_its_last(
-    root: Path, openings: dict[str, list[list[np.ndarray]]]
-) -> None:
-    path = root / VIDEOS / "1000.webm"
-    frames = read_clip(path, N)
-    error = [np.abs(a.astype(float) - b).mean() for a, b in zip(frames, openings["oven"][0], strict=True)]
-    assert max(error) < 8, "video is lossy"
-    few = read_clip(path, 3)
-    for frame, index in zip(few, (0, round((N - 1) / 2), N - 1), strict=True):
-        np.testing.assert_array_equal(frame, frames[index])
-    assert len(read_clip(path, 99)) == N
-
-
 def test_a_folder_of_pictures_is_a_clip_too(openings: dict[str, list[list[np.ndarray]]], tmp_path: Path) -> None:
     folder = tmp_path / "oven" / "first"
     folder.mkdir(parents=True)
     for i, frame in enumerate(openings["oven"][0]):
         Image.fromarray(frame).save(folder / f"{i:03d}.png")
-    np.testing.assert_array_equal(read_clip(folder, N), openings["oven"][0])
     assert folder_of_clips(tmp_path) == [Clip(folder, "oven")]
 
 
@@ -133,34 +117,11 @@ def test_labels_are_found_where_any_release_has_them(root: Path, name: str) -> N
     assert len(something_something(root)) == 6
 
 
-def test_a_video_of_changing_frame_rate_is_read_to_its_end(
-    openings: dict[str, list[list[np.ndarray]]], tmp_path: Path
-) -> None:
-    clip = openings["oven"][0]
-    slow, fast = tmp_path / "slow.mp4", tmp_path / "fast.mp4"
-    imageio.mimwrite(slow, clip[: N // 2], fps=2, quality=9)
-    imageio.mimwrite(fast, clip[N // 2 :], fps=30, quality=9)
-    (tmp_path / "parts.txt").write_text("file slow.mp4\nfile fast.mp4\n")
-    both = tmp_path / "both.mp4"
-    ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
-    words = [ffmpeg, "-loglevel", "error", "-f", "concat", "-i", tmp_path / "parts.txt", "-c", "copy", both]
-    subprocess.run(words, check=True)
-    last = read_clip(both, 5)[-1].astype(float)
-    errors = [np.abs(last - frame).mean() for frame in clip]
-    assert int(np.argmin(errors)) == N - 1
-
-
-def test_pictures_are_taken_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    for i in range(12):
-        Image.new("RGB", (8, 8), (20 * i, 0, 0)).save(tmp_path / f"frame{i}.png")
-    assert [int(frame[0, 0, 0]) for frame in read_clip(tmp_path, 12)] == [20 * i for i in range(12)]
-
-
 def test_clips_are_embedded_once(root: Path) -> None:
     clips, embedder = something_something(root)[:2], load_embedder("efficientnet-lite0")
     done: list[None] = []
     first = embed_clips(clips, embedder, 4, on_done=lambda: done.append(None))
-    np.testing.assert_allclose(first[0], embedder.embed_images(read_clip(clips[0].path, 4)), atol=1e-4)
+    np.testing.assert_allclose(first[0], embedder.embed_images(read_frames(clips[0].path, 4)), atol=1e-4)
     assert len(done) == 2
     copies = [Clip(clip.path.rename(root / VIDEOS / f"moved-{clip.path.name}"), "oven") for clip in clips]
 
@@ -204,7 +165,7 @@ def test_the_verb_judges_the_frames_that_score_highest(root: Path, zest: Callabl
         assert row["goal_frame_ratio"] == pytest.approx(2 / 11)
         assert row["top_n_success"]["ci95"][0] <= row["top_n_success"]["value"] <= row["top_n_success"]["ci95"][1]
     embedder = load_embedder("efficientnet-lite0")
-    clips = [embedder.embed_images(read_clip(root / VIDEOS / f"{1000 + i}.webm", N)) for i in range(3)]
+    clips = [embedder.embed_images(read_frames(root / VIDEOS / f"{1000 + i}.webm", N)) for i in range(3)]
     shares = []
     for goal in range(3):
         scored = [
@@ -339,14 +300,10 @@ def test_an_object_with_few_clips_is_left_out_and_named(root: Path, capsys: pyte
 def test_what_cannot_be_read_is_refused_by_name(root: Path, spoil: Callable[[Path], object], message: str) -> None:
     spoil(root)
     with pytest.raises(BadInput, match=message):
-        read_clip(something_something(root)[0].path, 4)
+        read_frames(something_something(root)[0].path, 4)
 
 
 def test_a_folder_without_clips_is_refused(tmp_path: Path) -> None:
     for root in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(BadInput, match="must hold a folder per object"):
             folder_of_clips(root)
-    with pytest.raises(BadInput, match="is not a file"):
-        read_clip(tmp_path / "nowhere.mp4", 4)
-    with pytest.raises(BadInput, match="at least 2 frames"):
-        read_clip(tmp_path, 1)

@@ -341,13 +341,6 @@ def test_a_malformed_env_spec_is_refused(collected: str, spec: str) -> None:
         reader.read_metadata(collected)
 
 
-@pytest.mark.parametrize("name", ["gymnasium.envs.x:Y", "gymnasium_robotics.envs.x:Y", "zest_rl.envs:KitchenEnv"])
-def test_known_packages_are_trusted(name: str) -> None:
-    reader.check_env_spec(json.dumps({"entry_point": name, "additional_wrappers": []}), "it", "stop")
-    with pytest.raises(BadInput, match="it would run code of"):
-        reader.check_env_spec(json.dumps({"entry_point": name.replace(".", "_evil.", 1)}), "it", "stop")
-
-
 # --- identity ---------------------------------------------------------------------------------------------------------
 
 

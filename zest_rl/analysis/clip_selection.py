@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import imageio.v2 as imageio
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.data.images import list_images, read_image
+from zest_rl.data.video import VIDEO_SUFFIXES, read_frames
 from zest_rl.embedders import Embedder
 from zest_rl.errors import BadInput, nearest
 from zest_rl.metrics.selection import others
@@ -26,8 +24,7 @@ from zest_rl.metrics.statistics import Values
 from zest_rl.rewards.scores import Features, Similarity, score_views
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.parallel import one_thread, read_arrays, write_arrays
-from zest_rl.simulation.views import evenly_spaced
-from zest_rl.types import FloatArray, Frame
+from zest_rl.types import FloatArray
 
 OPENING = "Opening [something]"
 OBJECTS = ("door", "drawer", "box", "fridge", "laptop", "washing machine", "oven")
@@ -48,7 +45,6 @@ LABELS = tuple(
     for part in ("train", "validation")
 )
 """Where the labels of its releases stand."""
-VIDEO_SUFFIXES = (".avi", ".mkv", ".mov", ".mp4", ".webm")
 
 
 @dataclass(frozen=True)
@@ -59,53 +55,6 @@ class Clip:
     """A video file, or a folder of pictures in the order of their names."""
     thing: str
     """What is acted on."""
-
-
-def read_clip(path: Path, n_frames: int) -> list[Frame]:
-    """Read frames that are evenly spaced over a clip, the first and the last among them.
-
-    Args:
-        path: a video file that ffmpeg reads, or a folder of pictures.
-        n_frames: how many; a shorter clip gives all it has.
-
-    Returns:
-        (H, W, 3) uint8 RGB each.
-
-    Raises:
-        BadInput: nothing there, no video, or fewer than 2 frames.
-    """
-    if n_frames < 2:
-        raise BadInput(f"a clip needs at least 2 frames, its first and its last, got {n_frames}")
-    if path.is_dir():
-        pictures = sorted(list_images(path), key=by_number)
-        frames = [read_image(pictures[i]) for i in evenly_spaced(len(pictures), n_frames)]
-    elif not path.is_file():
-        raise BadInput(f"{path} is not a file; give a video or a folder of pictures")
-    else:
-        try:
-            n = sum(1 for _ in decoded(path))  # what the file says of its length may not be what is decoded
-            wanted = set(evenly_spaced(n, n_frames).tolist())
-            frames = [frame for i, frame in enumerate(decoded(path)) if i in wanted]
-        except (OSError, RuntimeError, ValueError, IndexError) as error:
-            reason = " ".join(str(error).split())[:200]
-            raise BadInput(f"{path} cannot be read as a video ({reason}); copy it, or convert it to MP4") from error
-    if len(frames) < 2:
-        raise BadInput(f"{path} has {len(frames)} frames, at least 2 are needed; remove it")
-    return frames
-
-
-def by_number(path: Path) -> list[int | str]:
-    """Order frame2 before frame10."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
-
-
-def decoded(path: Path) -> Iterator[Frame]:
-    """Yield all frames of a video, each as it is stored, (H, W, 3) uint8 RGB; raises what imageio raises."""
-    as_stored = ["-fps_mode", "passthrough"]  # else frames are repeated or dropped to a constant rate
-    with imageio.get_reader(path, "ffmpeg", output_params=as_stored) as video:
-        reader: Any = video
-        for frame in reader.iter_data():
-            yield np.asarray(frame, dtype=np.uint8)
 
 
 def find_clips(root: Path, template: str = OPENING) -> list[Clip]:
@@ -212,7 +161,7 @@ def embed_clips(
         cached = read_arrays(path)
         if cached is None:
             with one_thread():
-                cached = {"embeddings": embedder.embed_images(read_clip(clip.path, n_frames))}
+                cached = {"embeddings": embedder.embed_images(read_frames(clip.path, n_frames))}
             write_arrays(path, cached)
         vectors.append(np.asarray(cached["embeddings"], dtype=np.float32))
         on_done()

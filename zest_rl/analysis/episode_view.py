@@ -8,8 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.data.video import evenly_spaced
 from zest_rl.rewards.scorer import Scorer
-from zest_rl.simulation.views import canonical_states, evenly_spaced
+from zest_rl.simulation.views import canonical_states
 from zest_rl.types import FloatArray
 
 N_FRAMES = 8

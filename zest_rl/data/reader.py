@@ -31,13 +31,13 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.data.env_specs import entry_points
 from zest_rl.data.observations import acts_discretely, entries, is_numbers, numbers, stored_rows
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime import artifacts
 from zest_rl.types import Episode, FloatArray, GroundTruth
 
 DATASET_ID = re.compile(r"(?:[A-Za-z0-9][\w.-]+/)*[A-Za-z0-9][\w.-]*-v\d+")
-TRUSTED_ENTRY_POINTS = ("gymnasium.", "gymnasium_robotics.", "zest_rl.")
 DATA_FILE, METADATA_FILE, MANIFEST_FILE = "data/main_data.hdf5", "data/metadata.json", "zest_manifest.json"
 SOURCE_REWARD, SOURCE_SUCCESS = "infos/source/reward", "infos/source/success"
 """Where the rewards and successes of another environment's dataset are kept (T+1,) when it is relabeled."""
@@ -78,7 +78,7 @@ def exists(dataset_id: str) -> bool:
 def read_metadata(dataset_id: str) -> dict[str, Any]:
     """Return a dataset's metadata after checking that its files are as they were written.
 
-    Whoever builds an environment from them calls `check_env_spec` first; reading runs no code of it.
+    Whoever builds an environment from them checks them by `zest_rl.data.env_specs` first; reading runs no code of it.
 
     Raises:
         BadInput: no such dataset (the nearest are named), or an env_spec in it is none.
@@ -101,31 +101,8 @@ def read_metadata(dataset_id: str) -> dict[str, Any]:
     metadata: dict[str, Any] = artifacts.read_json(folder / METADATA_FILE)
     for key in ("env_spec", "eval_env_spec"):
         if metadata.get(key):
-            _entry_points(metadata[key], f"the {key} of dataset {dataset_id}")
+            entry_points(metadata[key], f"the {key} of dataset {dataset_id}")
     return metadata
-
-
-def _entry_points(env_spec: str, what: str) -> list[str]:
-    """Return the code that a Gymnasium EnvSpec (JSON) would run: of its environment, and of wrappers."""
-    try:
-        spec = json.loads(env_spec)
-        return [str(part["entry_point"]) for part in (spec, *spec.get("additional_wrappers", ()))]
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise BadInput(f"{what} is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
-
-
-def check_env_spec(env_spec: str, what: str, instead: str) -> None:
-    """Refuse a Gymnasium EnvSpec (JSON) that would run code of an unknown package: of its environment or a wrapper.
-
-    Raises:
-        BadInput: such an entry point, or not an EnvSpec; `what` names it in the message, `instead` ends it.
-    """
-    for entry_point in _entry_points(env_spec, what):
-        if not entry_point.startswith(TRUSTED_ENTRY_POINTS):
-            raise BadInput(
-                f"{what} would run code of {entry_point!r}; only {', '.join(p + '*' for p in TRUSTED_ENTRY_POINTS)} "
-                f"are trusted; {instead}"
-            )
 
 
 @contextmanager

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from zest_rl.agents import Policy, load_policy
 from zest_rl.data import reader
-from zest_rl.data.reader import check_env_spec
+from zest_rl.data.env_specs import check_env_spec, check_registered
 from zest_rl.errors import BadInput, nearest
-from zest_rl.kitchen.env import ENV_ID, check_registered
+from zest_rl.kitchen.env import ENV_ID
 from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return, wilson
 from zest_rl.rewards.relabel import SCORER_FILE, Reward
 from zest_rl.rewards.scorer import Scorer

@@ -210,19 +210,4 @@ def _clip_to_ranges(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> NDArray
     return clipped
 
 
-def check_registered(spec: gymnasium.envs.registration.EnvSpec) -> None:
-    """Refuse a spec from elsewhere whose entry point is not the registered one: it could call any function.
-
-    Raises:
-        BadInput: such an entry point, or an id that is not registered here.
-    """
-    known = gymnasium.registry.get(spec.id)
-    if known is None or spec.entry_point != known.entry_point:
-        raise BadInput(
-            f"{spec.id} would run code of {spec.entry_point!r}, but "
-            + ("is not registered here" if known is None else f"is registered as {known.entry_point!r}")
-            + "; install the version of its package that it was recorded with"
-        )
-
-
 gymnasium.register(id=ENV_ID, entry_point="zest_rl.envs:KitchenEnv", max_episode_steps=HORIZON)

@@ -17,9 +17,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.analysis.clip_selection import Clip, embed_clips, read_clip
+from zest_rl.analysis.clip_selection import Clip, embed_clips
 from zest_rl.analysis.episode_view import N_FRAMES, Look
 from zest_rl.data.images import read_image
+from zest_rl.data.video import evenly_spaced, read_frames
 from zest_rl.embedders import Embedder
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen.collect import env_spec
@@ -29,7 +30,6 @@ from zest_rl.report import Curve, Report, Strip
 from zest_rl.rewards.goals import TEXT, GoalSpec, embed_goal, read_folder, read_text
 from zest_rl.rewards.scorer import Scorer
 from zest_rl.rewards.scores import Features, Similarity, score_views
-from zest_rl.simulation.views import evenly_spaced
 from zest_rl.types import FloatArray, Frame
 
 
@@ -180,7 +180,7 @@ def follow_clip(
     """
     if not specs or len(set(specs)) < len(specs):
         raise BadInput(f"a video needs 1 or more sub-goals, each once, got {', '.join(specs) or 'none'}")
-    frames = read_clip(path, n_frames)
+    frames = read_frames(path, n_frames)
     goals = [read_subgoal(spec, frames[0]) for spec in specs]
     pairs = [embed_goal(goal, embedder) for goal in goals]
     (embeddings,) = embed_clips([Clip(path, "")], embedder, n_frames)

@@ -83,11 +83,6 @@ def distinct_states(qpos: NDArray[np.float64], views: Views) -> NDArray[np.float
     return in_order
 
 
-def evenly_spaced(n: int, n_wanted: int) -> NDArray[np.intp]:
-    """Indices of up to `n_wanted` of n frames, evenly spaced, the first and the last among them."""
-    return np.unique(np.linspace(0, n - 1, min(n, n_wanted)).round().astype(np.intp)) if n else np.zeros(0, np.intp)
-
-
 def state_keys(states: NDArray[np.float64]) -> list[bytes]:
     """One key per row of canonical states."""
     return [row.tobytes() for row in np.ascontiguousarray(states)]

@@ -1,9 +1,9 @@
 """Recorded simulator states of a Gymnasium environment → frames, rendered from the environment's own model.
 
-A frame is drawn as the kitchen's are: no shadows, reflections, multisampling or sky. It shows the
-state exactly where all that moves is in qpos, or is known to `SCENERY`: targets and furniture that an environment puts
-elsewhere in each episode. Only registered environments of the allow-listed packages are made, without their wrappers
-(`zest_rl.data.reader.check_env_spec`, `zest_rl.kitchen.env.check_registered`).
+A frame is drawn as the kitchen's are: no shadows, reflections, multisampling or sky. It shows the state exactly where
+all that moves is in qpos, or is known to `SCENERY`: targets and furniture that an environment puts elsewhere in each
+episode. Only registered environments of the allow-listed packages are made, without their wrappers
+(`zest_rl.data.env_specs`).
 """
 
 from __future__ import annotations
@@ -27,10 +27,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.data.env_specs import check_env_spec, check_registered
 from zest_rl.data.observations import entries
-from zest_rl.data.reader import check_env_spec
 from zest_rl.errors import BadInput, ZestError, nearest
-from zest_rl.kitchen.env import check_registered
 from zest_rl.runtime import artifacts
 from zest_rl.simulation.rendering import Canvas
 from zest_rl.sources import rebuilt_states

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from zest_rl.analysis.clip_selection import VIDEO_SUFFIXES, by_number, decoded
-from zest_rl.data.images import list_images, read_image
+from zest_rl.data.video import VIDEO_SUFFIXES, frame_files, iter_frames
 from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
 from zest_rl.types import Frame
@@ -48,7 +47,7 @@ class Clips:
         """Decode the views side by side."""
         paths = [of[episode] for of in self.paths]
         try:
-            yield from zip(*map(_decode, paths), strict=True)
+            yield from zip(*map(iter_frames, paths), strict=True)
         except ValueError as error:
             if isinstance(error, BadInput):
                 raise
@@ -56,18 +55,7 @@ class Clips:
 
 
 def _files(path: Path) -> list[Path]:
-    return sorted(list_images(path), key=by_number) if path.is_dir() else [path]
-
-
-def _decode(path: Path) -> Iterator[Frame]:
-    if path.is_dir():
-        yield from map(read_image, _files(path))
-        return
-    try:
-        yield from decoded(path)
-    except (OSError, RuntimeError, IndexError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise BadInput(f"{path} cannot be read as a video ({reason}); copy it, or convert it to MP4") from error
+    return frame_files(path) if path.is_dir() else [path]
 
 
 def find_clips(folders: Sequence[Path], n_episodes: int, what: str) -> Clips:

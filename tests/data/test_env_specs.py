@@ -1,0 +1,41 @@
+"""Which environments may be made from what a file says."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import gymnasium
+import pytest
+
+from zest_rl.data.env_specs import check_env_spec, check_registered, entry_points
+from zest_rl.errors import BadInput
+
+
+@pytest.mark.parametrize("name", ["gymnasium.envs.x:Y", "gymnasium_robotics.envs.x:Y", "zest_rl.envs:KitchenEnv"])
+def test_known_packages_are_trusted(name: str) -> None:
+    check_env_spec(json.dumps({"entry_point": name, "additional_wrappers": []}), "it", "stop")
+    with pytest.raises(BadInput, match="it would run code of"):
+        check_env_spec(json.dumps({"entry_point": name.replace(".", "_evil.", 1)}), "it", "stop")
+
+
+def test_the_code_of_wrappers_counts_too() -> None:
+    spec = {"entry_point": "gymnasium.envs.x:Y", "additional_wrappers": [{"entry_point": "evil:make"}]}
+    assert entry_points(json.dumps(spec), "it") == ["gymnasium.envs.x:Y", "evil:make"]
+    with pytest.raises(BadInput, match=r"it would run code of 'evil:make'; only .* are trusted; stop"):
+        check_env_spec(json.dumps(spec), "it", "stop")
+
+
+@pytest.mark.parametrize("spec", ["{", "null", "[]", "{}", '{"entry_point": "zest_rl.x", "additional_wrappers": 3}'])
+def test_what_is_no_env_spec_is_refused(spec: str) -> None:
+    with pytest.raises(BadInput, match="it is not the JSON of a Gymnasium EnvSpec"):
+        entry_points(spec, "it")
+
+
+def test_an_id_stands_for_the_code_that_is_registered_under_it() -> None:
+    spec = gymnasium.spec("CartPole-v1")
+    check_registered(spec)
+    with pytest.raises(BadInput, match=r"would run code of 'gymnasium\.spaces:Box', but is registered as"):
+        check_registered(replace(spec, entry_point="gymnasium.spaces:Box"))
+    with pytest.raises(BadInput, match="is not registered here; install the version of its package"):
+        check_registered(replace(spec, id="Nowhere-v1"))
