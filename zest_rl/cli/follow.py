@@ -14,7 +14,7 @@ from zest_rl.cli.ui import Ui
 from zest_rl.rewards.scores import Features, Similarity, check_names
 
 if TYPE_CHECKING:
-    from zest_rl.kitchen.task_sequence import Followed
+    from zest_rl.analysis.sub_goals import SubGoalScores
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,30 +79,22 @@ CONFIGS: dict[str, type[Any]] = {config.what: config for config in (KitchenArgum
 
 def run(config: KitchenArguments | VideoArguments, ui: Ui) -> dict[str, Any]:
     """Score the episode by each sub-goal and write the page."""
-    from zest_rl.kitchen.task_sequence import follow_report, rise_in_order
+    from zest_rl.analysis.sub_goals import rise_in_order
     from zest_rl.report import write_report
+    from zest_rl.report.sub_goal_page import sub_goal_report
     from zest_rl.runtime import artifacts
 
-    followed = _kitchen(config, ui) if isinstance(config, KitchenArguments) else _video(config)
-    in_order = rise_in_order(followed)
+    sub_goals = _kitchen(config, ui) if isinstance(config, KitchenArguments) else _video(config)
+    in_order = rise_in_order(sub_goals)
     if not in_order:
         ui.warn("the scores do not rise in the order of the sub-goals; look at the page")
-    settings = {**asdict(config), "output": str(config.output)}
-    if isinstance(config, VideoArguments):
-        settings["clip"] = str(config.clip)
-    details: dict[str, object] = {"settings": settings, "provenance": artifacts.provenance()}
-    page = write_report(follow_report("Similarity to each sub-goal", followed, details), config.output)
+    settings = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(config).items()}
+    page = write_report(
+        sub_goal_report(sub_goals, {"settings": settings, "provenance": artifacts.provenance()}), config.output
+    )
     return {
         "follow": config.what,
-        "sub_goals": {
-            one.name: {
-                "rises_at": one.rises_at,
-                "highest_at": one.highest_at,
-                "done_at": one.done_at,
-                "scores": [round(float(score), 4) for score in one.scores],
-            }
-            for one in followed
-        },
+        "sub_goals": {sub_goal.name: sub_goal.as_json() for sub_goal in sub_goals},
         "in_order": in_order,
         "settings": settings,
         "report": str(page),
@@ -110,14 +102,12 @@ def run(config: KitchenArguments | VideoArguments, ui: Ui) -> dict[str, Any]:
     }
 
 
-def _kitchen(config: KitchenArguments, ui: Ui) -> list[Followed]:
-    from zest_rl.kitchen.task_sequence import follow_performance, perform
-    from zest_rl.kitchen.tasks import get_task
+def _kitchen(config: KitchenArguments, ui: Ui) -> list[SubGoalScores]:
+    from zest_rl.analysis.sub_goals import score_performance
+    from zest_rl.kitchen.task_sequence import perform
     from zest_rl.rewards.scorer import Scorer, ScorerConfig
     from zest_rl.simulation.views import Views
 
-    for task in config.tasks:
-        get_task(task)
     performance = perform(config.tasks, config.seed)
 
     def build(task: str) -> Scorer:
@@ -126,18 +116,18 @@ def _kitchen(config: KitchenArguments, ui: Ui) -> list[Followed]:
         return Scorer.build(scorer, performance.states[0], device=config.device, n_workers=config.n_workers)
 
     with ui.progress("sub-goals", len(config.tasks)) as advance:
-        return follow_performance(performance, build, advance)
+        return score_performance(performance, build, advance)
 
 
-def _video(config: VideoArguments) -> list[Followed]:
+def _video(config: VideoArguments) -> list[SubGoalScores]:
+    from zest_rl.analysis.sub_goals import score_video
     from zest_rl.embedders import load_embedder
-    from zest_rl.kitchen.task_sequence import follow_clip
     from zest_rl.rewards.goals import TEXT
 
     embedder = load_embedder(config.embedder, device=config.device, precision=config.precision)
     goals = [goal if goal.startswith(TEXT) else str(expand_variables(Path(goal))) for goal in config.goals]
     clip = expand_variables(config.clip)
-    return follow_clip(clip, goals, embedder, config.n_frames, config.features, config.similarity)
+    return score_video(clip, goals, embedder, config.n_frames, config.features, config.similarity)
 
 
 def summary(result: Mapping[str, Any]) -> str:
