@@ -12,18 +12,20 @@ Layout of one dataset, alignment in `zest_rl.types`::
 Datasets of other environments may hold observations in a group (`zest_rl.data.observations`), no state and no ground
 truth; once relabeled, what they came with is ``infos/source/{reward, success}`` (T+1,), 0 at the reset.
 
-Ground truth is read by `read_ground_truth` alone; `read_episodes` and `read_states` never open it.
+`open_dataset` verifies the files once for all that is read. Ground truth is read by `Dataset.truth` alone;
+`Dataset.episodes` and `Dataset.states` never open it.
 """
 
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,7 @@ from numpy.typing import NDArray
 
 from zest_rl.data.env_specs import entry_points
 from zest_rl.data.observations import acts_discretely, entries, is_numbers, numbers, stored_rows
+from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime import artifacts
 from zest_rl.types import Episode, FloatArray, GroundTruth
@@ -105,17 +108,246 @@ def read_metadata(dataset_id: str) -> dict[str, Any]:
     return metadata
 
 
+@dataclass(frozen=True)
+class Dataset:
+    """An open dataset, whose files were found as they were written. Made by `open_dataset`."""
+
+    id: str
+    path: Path
+    """Its folder."""
+    metadata: Mapping[str, Any]
+    """As they are on disk; `record` is what this package knows of them."""
+    groups: Mapping[str, h5py.Group]
+    """Episodes by their names in the HDF5 file, ``episode_0`` first; gone once the dataset is closed."""
+
+    @cached_property
+    def record(self) -> DatasetRecord:
+        """Environment, scale, and how it was made."""
+        return DatasetRecord.from_metadata(self.id, self.metadata)
+
+    @property
+    def file(self) -> Path:
+        """The HDF5 file."""
+        return self.path / DATA_FILE
+
+    def episodes(self, *, discrete: bool = False) -> list[Episode]:
+        """Read what a trainer may see of every episode; a Dict of observations is flattened (`observations.numbers`).
+
+        Actions of several dimensions are flattened; those of a Discrete space (T,) are read as (T, 1) where `discrete`.
+
+        Raises:
+            BadInput: an episode without steps, lengths that do not fit, NaN, no observations but pictures, discrete
+                actions that were not asked for.
+            ZestError: the file is damaged.
+        """
+
+        def read(group: h5py.Group) -> Episode:
+            ends = self._array(group, "terminations", bool)
+            return Episode(
+                obs=self._observations(group),
+                actions=self._actions(group, discrete),
+                rewards=self._array(group, "rewards", np.float32),
+                terminated=bool(len(ends) and ends[-1]),
+            )
+
+        return self._each(read)
+
+    def n_steps(self) -> list[int]:
+        """Read T of every episode; rewards need not be recorded.
+
+        Raises:
+            BadInput: rewards of another length.
+        """
+
+        def read(group: h5py.Group) -> int:
+            n_steps = len(self._array(group, "terminations", bool))
+            if "rewards" in group and len(group["rewards"]) != n_steps:
+                raise BadInput(f"rewards must be as many as terminations, {n_steps}, got {len(group['rewards'])}")
+            return n_steps
+
+        return self._each(read)
+
+    def rewards(self) -> list[FloatArray]:
+        """Read the rewards (T,) of every episode.
+
+        Raises:
+            BadInput: there are none.
+        """
+        return self._each(lambda group: self._array(group, "rewards", np.float32))
+
+    def states(self) -> list[NDArray[np.float64]]:
+        """Read the simulator positions (T+1, nq) of every episode.
+
+        Raises:
+            BadInput: no recorded state, lengths that do not fit, NaN.
+        """
+
+        def read(group: h5py.Group) -> NDArray[np.float64]:
+            qpos = self._array(group, "infos/state/qpos", np.float64)
+            n_steps = len(self._array(group, "rewards", np.float32))
+            if n_steps == 0:
+                raise BadInput("an episode must have at least 1 step, got 0; drop empty episodes from the dataset")
+            if qpos.ndim != 2 or len(qpos) != n_steps + 1:
+                raise BadInput(f"infos/state/qpos must have shape ({n_steps + 1}, nq), got {qpos.shape}")
+            if not np.isfinite(qpos).all():
+                raise BadInput("infos/state/qpos must be finite, got NaN or infinity; drop the episode")
+            return qpos
+
+        return self._each(read)
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether any episode holds the hand-designed rewards; `truth` refuses a dataset where some do not."""
+        return any(_GT_REWARD in group for group in self.groups.values())
+
+    def truth(self) -> list[GroundTruth]:
+        """Read the hand-designed rewards of every episode: for evaluation and reports only, never for a trainer.
+
+        Raises:
+            BadInput: no ground truth is recorded.
+        """
+        return self._each(
+            lambda group: GroundTruth(
+                rewards=self._array(group, _GT_REWARD, np.float32)[1:],
+                success=bool(self._array(group, "infos/gt/success", bool).any()),
+            )
+        )
+
+    def scores(self) -> list[FloatArray]:
+        """Read the ZeST scores (T+1,) of every episode.
+
+        Raises:
+            BadInput: the dataset was not relabeled.
+        """
+        return self._each(lambda group: self._array(group, "infos/zest/score", np.float32))
+
+    def source_rewards(self) -> list[FloatArray] | None:
+        """Read the rewards (T,) that a dataset of another environment had before it was relabeled; None: no such."""
+        read = self._each(lambda group: self._source_reward(group) if SOURCE_REWARD in group else None)
+        return None if any(rewards is None for rewards in read) else read
+
+    def rewards_to_keep(self) -> list[FloatArray | None]:
+        """Read the rewards (T,) of every episode that a copy keeps as its source's; None: none, or ground truth."""
+
+        def read(group: h5py.Group) -> FloatArray | None:
+            if _GT_REWARD in group:
+                return None
+            if SOURCE_REWARD in group:
+                return self._source_reward(group)
+            return self._array(group, "rewards", np.float32) if "rewards" in group else None
+
+        return self._each(read)
+
+    def fingerprint(self) -> str:
+        """Hash what relabeling and training may see: observations, actions, ends and states; no rewards."""
+
+        def digest(group: h5py.Group) -> str:
+            if "observations" not in group:
+                raise BadInput(f"dataset {self.id} has no 'observations' in {group.name}")
+            actions = self._array(group, "actions", np.float32)
+            ends = self._array(group, "terminations", bool)
+            arrays = [actions, np.array([bool(len(ends) and ends[-1])])]
+            if "infos/state/qpos" in group:
+                arrays.append(self._array(group, "infos/state/qpos", np.float64))
+            return artifacts.hash_stream(itertools.chain(_observed(group["observations"]), arrays))
+
+        return artifacts.hash_json(self._each(digest))
+
+    def describe(self) -> dict[str, Any]:
+        """What a trained policy must remember of its dataset, JSON-ready: identity, environment, scale, provenance.
+
+        Command, versions and machine stay in the dataset's metadata: an equal dataset made again has an equal
+        description. `DatasetRecord.from_description` reads it.
+
+        Raises:
+            BadInput: a policy could not be evaluated on the dataset, or as in `episodes`.
+        """
+        for key in ("env_spec", "ref_min_score", "ref_max_score"):
+            if self.metadata.get(key) is None and not self.record.is_foreign:
+                raise BadInput(
+                    f"dataset {self.id} has no {key} in its metadata, so a policy could not be evaluated on it; "
+                    "give env, eval_env and both reference scores when the dataset is made"
+                )
+        return {
+            "id": self.id,
+            "sha256": self.fingerprint(),
+            "rewards_sha256": artifacts.hash_arrays(*(episode.rewards for episode in self.episodes())),
+            "env_spec": self.record.env_spec,
+            "ref_min_score": self.record.ref_min_score,
+            "ref_max_score": self.record.ref_max_score,
+            "zest": {
+                stage: {key: value for key, value in facts.items() if key != "provenance"}
+                for stage, facts in self.metadata.get("zest", {}).items()
+            },
+        }
+
+    def kitchen_task(self) -> str:
+        """Return which kitchen task the dataset is of.
+
+        Raises:
+            BadInput: its environment is not the kitchen.
+        """
+        if self.record.task is None:
+            raise BadInput(
+                f"dataset {self.id} is of environment {self.record.env.get('id')!r}; frames can be rendered for "
+                "zest/Kitchen-v1 only, so collect a dataset with `zest collect`; `zest relabel` alone takes any, see "
+                "docs/any_dataset.md"
+            )
+        return self.record.task
+
+    def _each(self, read: Callable[[h5py.Group], Any]) -> list[Any]:
+        results = []
+        for name, group in self.groups.items():
+            try:
+                results.append(read(group))
+            except BadInput as error:
+                raise BadInput(f"{name} of dataset {self.id}: {error}") from error
+            except OSError as error:
+                raise ZestError(f"{name} of dataset {self.id} is damaged ({error}); make it again") from error
+        return results
+
+    def _array(self, group: h5py.Group, name: str, dtype: type) -> NDArray[Any]:
+        if name not in group:
+            raise BadInput(
+                f"dataset {self.id} has no {name!r} in {group.name}; record it when the dataset is made "
+                "(zest_rl.data.reader describes the layout)"
+            )
+        node = group[name]
+        if not isinstance(node, h5py.Dataset):
+            raise BadInput(f"{name!r} in {group.name} of dataset {self.id} must be one flat array, got a group")
+        return np.asarray(node[()], dtype=dtype)
+
+    def _observations(self, group: h5py.Group) -> FloatArray:
+        node = group.get("observations")
+        if isinstance(node, h5py.Group) or (node is not None and node.ndim != 2):
+            return numbers(node)
+        return self._array(group, "observations", np.float32)
+
+    def _actions(self, group: h5py.Group, discrete: bool) -> FloatArray:
+        actions = self._array(group, "actions", np.float32)
+        whole = acts_discretely(group)
+        if whole and not discrete:
+            raise BadInput("its actions are discrete, a policy here acts by continuous ones; `zest export` takes them")
+        return actions.reshape(len(actions), math.prod(actions.shape[1:])) if actions.ndim > 1 or whole else actions
+
+    def _source_reward(self, group: h5py.Group) -> FloatArray:
+        return self._array(group, SOURCE_REWARD, np.float32)[1:]
+
+
 @contextmanager
-def open_episodes(dataset_id: str) -> Iterator[tuple[h5py.File, list[str]]]:
-    """Open the HDF5 file after checking all files as `read_metadata` does; yield it and its episodes' names, in order.
+def open_dataset(dataset_id: str) -> Iterator[Dataset]:
+    """Open a dataset after comparing its files with their hashes, once for all that is read of it.
+
+    Whoever builds an environment from its env_spec checks it by `zest_rl.data.env_specs` first; reading runs no code.
 
     Raises:
-        BadInput: no such dataset, another storage than HDF5, or episodes are missing.
+        BadInput: no such dataset (the nearest are named), an env_spec in it is none, another storage than HDF5, or
+            episodes are missing.
+        ZestError: a file was damaged or changed since it was written.
     """
-    read_metadata(dataset_id)
-    path = dataset_path(dataset_id) / DATA_FILE
+    metadata, path = read_metadata(dataset_id), dataset_path(dataset_id)
     try:
-        file = h5py.File(path, "r")
+        file = h5py.File(path / DATA_FILE, "r")
     except OSError as error:
         raise BadInput(f"dataset {dataset_id} cannot be read as HDF5 ({error}); only that storage is read") from error
     with file:
@@ -127,190 +359,7 @@ def open_episodes(dataset_id: str) -> Iterator[tuple[h5py.File, list[str]]]:
                 f"dataset {dataset_id} must hold {names[0]}, … {names[-1]}, as Minari needs it, but {missing[0]} "
                 f"is missing from its {len(file)} groups; rename them, and set total_episodes in metadata.json"
             )
-        yield file, names
-
-
-def _array(group: h5py.Group, name: str, dtype: type, dataset_id: str) -> NDArray[Any]:
-    if name not in group:
-        raise BadInput(
-            f"dataset {dataset_id} has no {name!r} in {group.name}; record it when the dataset is made "
-            "(zest_rl.data.reader describes the layout)"
-        )
-    node = group[name]
-    if not isinstance(node, h5py.Dataset):
-        raise BadInput(f"{name!r} in {group.name} of dataset {dataset_id} must be one flat array, got a group")
-    return np.asarray(node[()], dtype=dtype)
-
-
-def _each(dataset_id: str, read: Callable[[h5py.Group], Any]) -> list[Any]:
-    results = []
-    with open_episodes(dataset_id) as (file, names):
-        for name in names:
-            try:
-                results.append(read(file[name]))
-            except BadInput as error:
-                raise BadInput(f"{name} of dataset {dataset_id}: {error}") from error
-            except OSError as error:
-                raise ZestError(f"{name} of dataset {dataset_id} is damaged ({error}); make it again") from error
-    return results
-
-
-def _observations(group: h5py.Group, dataset_id: str) -> FloatArray:
-    node = group.get("observations")
-    if isinstance(node, h5py.Group) or (node is not None and node.ndim != 2):
-        return numbers(node)
-    return _array(group, "observations", np.float32, dataset_id)
-
-
-def _actions(group: h5py.Group, dataset_id: str, discrete: bool) -> FloatArray:
-    actions = _array(group, "actions", np.float32, dataset_id)
-    whole = acts_discretely(group)
-    if whole and not discrete:
-        raise BadInput("its actions are discrete, a policy here acts by continuous ones; `zest export` takes them")
-    return actions.reshape(len(actions), math.prod(actions.shape[1:])) if actions.ndim > 1 or whole else actions
-
-
-def episode_names(dataset_id: str) -> list[str]:
-    """Return the names of the episodes' groups in the HDF5 file, in order; raises as `open_episodes` does."""
-    with open_episodes(dataset_id) as (_, names):
-        return names
-
-
-def read_episodes(dataset_id: str, *, discrete: bool = False) -> list[Episode]:
-    """Read what a trainer may see of every episode; a Dict of observations is flattened (`observations.numbers`).
-
-    Actions of several dimensions are flattened; those of a Discrete space (T,) are read as (T, 1) where `discrete`.
-
-    Raises:
-        BadInput: no such dataset, an episode without steps, lengths that do not fit, NaN, no observations but pictures,
-            discrete actions that were not asked for.
-        ZestError: the files were damaged.
-    """
-
-    def read(group: h5py.Group) -> Episode:
-        ends = _array(group, "terminations", bool, dataset_id)
-        return Episode(
-            obs=_observations(group, dataset_id),
-            actions=_actions(group, dataset_id, discrete),
-            rewards=_array(group, "rewards", np.float32, dataset_id),
-            terminated=bool(len(ends) and ends[-1]),
-        )
-
-    return _each(dataset_id, read)
-
-
-def read_lengths(dataset_id: str) -> list[int]:
-    """Read T of every episode; rewards need not be recorded.
-
-    Raises:
-        BadInput: no such dataset, or rewards of another length.
-    """
-
-    def read(group: h5py.Group) -> int:
-        n_steps = len(_array(group, "terminations", bool, dataset_id))
-        if "rewards" in group and len(group["rewards"]) != n_steps:
-            raise BadInput(f"rewards must be as many as terminations, {n_steps}, got {len(group['rewards'])}")
-        return n_steps
-
-    return _each(dataset_id, read)
-
-
-def read_rewards(dataset_id: str) -> list[FloatArray]:
-    """Read the rewards (T,) of every episode, and nothing else.
-
-    Raises:
-        BadInput: no such dataset, or one without rewards.
-    """
-    return _each(dataset_id, lambda group: _array(group, "rewards", np.float32, dataset_id))
-
-
-def read_states(dataset_id: str) -> list[NDArray[np.float64]]:
-    """Read the simulator positions (T+1, nq) of every episode.
-
-    Raises:
-        BadInput: no such dataset, no recorded state, lengths that do not fit, NaN.
-    """
-
-    def read(group: h5py.Group) -> NDArray[np.float64]:
-        qpos = _array(group, "infos/state/qpos", np.float64, dataset_id)
-        n_steps = len(_array(group, "rewards", np.float32, dataset_id))
-        if n_steps == 0:
-            raise BadInput("an episode must have at least 1 step, got 0; drop empty episodes from the dataset")
-        if qpos.ndim != 2 or len(qpos) != n_steps + 1:
-            raise BadInput(f"infos/state/qpos must have shape ({n_steps + 1}, nq), got {qpos.shape}")
-        if not np.isfinite(qpos).all():
-            raise BadInput("infos/state/qpos must be finite, got NaN or infinity; drop the episode")
-        return qpos
-
-    return _each(dataset_id, read)
-
-
-def has_ground_truth(dataset_id: str) -> bool:
-    """Whether any episode holds the hand-designed rewards; `read_ground_truth` refuses a dataset where some do not."""
-    return any(_each(dataset_id, lambda group: _GT_REWARD in group))
-
-
-def read_ground_truth(dataset_id: str) -> list[GroundTruth]:
-    """Read the hand-designed rewards of every episode: for evaluation and reports only, never for a trainer.
-
-    Raises:
-        BadInput: no such dataset, or no ground truth is recorded in it.
-    """
-
-    def read(group: h5py.Group) -> GroundTruth:
-        return GroundTruth(
-            rewards=_array(group, _GT_REWARD, np.float32, dataset_id)[1:],
-            success=bool(_array(group, "infos/gt/success", bool, dataset_id).any()),
-        )
-
-    return _each(dataset_id, read)
-
-
-def read_scores(dataset_id: str) -> list[FloatArray]:
-    """Read the ZeST scores (T+1,) of every episode of a relabeled dataset.
-
-    Raises:
-        BadInput: no such dataset, or it was not relabeled.
-    """
-    return _each(dataset_id, lambda group: _array(group, "infos/zest/score", np.float32, dataset_id))
-
-
-def read_source_rewards(dataset_id: str) -> list[FloatArray] | None:
-    """Read the rewards (T,) that a dataset of another environment came with before it was relabeled; None: no such."""
-    found = _each(
-        dataset_id,
-        lambda group: _array(group, SOURCE_REWARD, np.float32, dataset_id)[1:] if SOURCE_REWARD in group else None,
-    )
-    return None if any(rewards is None for rewards in found) else found
-
-
-def rewards_to_keep(dataset_id: str) -> list[FloatArray | None]:
-    """Read the rewards (T,) of every episode that a copy keeps as its source's; None: none, or the ground truth."""
-
-    def read(group: h5py.Group) -> FloatArray | None:
-        if _GT_REWARD in group:
-            return None
-        if SOURCE_REWARD in group:
-            return _array(group, SOURCE_REWARD, np.float32, dataset_id)[1:]
-        return _array(group, "rewards", np.float32, dataset_id) if "rewards" in group else None
-
-    return _each(dataset_id, read)
-
-
-def fingerprint(dataset_id: str) -> str:
-    """Hash what relabeling and training may see of a dataset: observations, actions, ends and states; no rewards."""
-
-    def digest(group: h5py.Group) -> str:
-        if "observations" not in group:
-            raise BadInput(f"dataset {dataset_id} has no 'observations' in {group.name}")
-        actions = _array(group, "actions", np.float32, dataset_id)
-        ends = _array(group, "terminations", bool, dataset_id)
-        arrays = [actions, np.array([bool(len(ends) and ends[-1])])]
-        if "infos/state/qpos" in group:
-            arrays.append(_array(group, "infos/state/qpos", np.float64, dataset_id))
-        return artifacts.hash_stream(itertools.chain(_observed(group["observations"]), arrays))
-
-    return artifacts.hash_json(_each(dataset_id, digest))
+        yield Dataset(dataset_id, path, metadata, {name: file[name] for name in names})
 
 
 def _observed(node: h5py.Group | h5py.Dataset) -> Iterator[NDArray[Any]]:
@@ -322,55 +371,100 @@ def _observed(node: h5py.Group | h5py.Dataset) -> Iterator[NDArray[Any]]:
             yield from stored_rows(entry)
 
 
+# --- by id, opened each time: on their way out -----------------------------------------------------------------------
+
+
+@contextmanager
+def open_episodes(dataset_id: str) -> Iterator[tuple[h5py.File, list[str]]]:
+    """As `open_dataset`."""
+    with open_dataset(dataset_id) as ds:
+        yield ds.groups["episode_0"].file, list(ds.groups)
+
+
+def episode_names(dataset_id: str) -> list[str]:
+    """As `Dataset`."""
+    with open_dataset(dataset_id) as ds:
+        return list(ds.groups)
+
+
+def read_episodes(dataset_id: str, *, discrete: bool = False) -> list[Episode]:
+    """As `Dataset`."""
+    with open_dataset(dataset_id) as ds:
+        return ds.episodes(discrete=discrete)
+
+
+def read_lengths(dataset_id: str) -> list[int]:
+    """As `Dataset`."""
+    with open_dataset(dataset_id) as ds:
+        return ds.n_steps()
+
+
+def read_rewards(dataset_id: str) -> list[FloatArray]:
+    """As `Dataset`."""
+    with open_dataset(dataset_id) as ds:
+        return ds.rewards()
+
+
+def read_states(dataset_id: str) -> list[NDArray[np.float64]]:
+    """As `Dataset`."""
+    with open_dataset(dataset_id) as ds:
+        return ds.states()
+
+
+def has_ground_truth(dataset_id: str) -> bool:
+    """As `Dataset`."""
+    with open_dataset(dataset_id) as ds:
+        return ds.has_truth
+
+
+def read_ground_truth(dataset_id: str) -> list[GroundTruth]:
+    """As `Dataset`."""
+    with open_dataset(dataset_id) as ds:
+        return ds.truth()
+
+
+def read_scores(dataset_id: str) -> list[FloatArray]:
+    """As `Dataset`."""
+    with open_dataset(dataset_id) as ds:
+        return ds.scores()
+
+
+def read_source_rewards(dataset_id: str) -> list[FloatArray] | None:
+    """As `Dataset`."""
+    with open_dataset(dataset_id) as ds:
+        return ds.source_rewards()
+
+
+def rewards_to_keep(dataset_id: str) -> list[FloatArray | None]:
+    """As `Dataset`."""
+    with open_dataset(dataset_id) as ds:
+        return ds.rewards_to_keep()
+
+
+def fingerprint(dataset_id: str) -> str:
+    """As `Dataset`."""
+    with open_dataset(dataset_id) as ds:
+        return ds.fingerprint()
+
+
 def describe(dataset_id: str) -> dict[str, Any]:
-    """What a trained policy must remember of its dataset, JSON-ready: identity, environment, scale, how it was made.
-
-    Command, versions and machine stay in the dataset's metadata: an equal dataset made again has an equal description.
-    """
-    metadata = read_metadata(dataset_id)
-    for key in ("env_spec", "ref_min_score", "ref_max_score"):
-        if metadata.get(key) is None and not is_foreign(metadata):
-            raise BadInput(
-                f"dataset {dataset_id} has no {key} in its metadata, so a policy could not be evaluated on it; "
-                "give env, eval_env and both reference scores when the dataset is made"
-            )
-    return {
-        "id": dataset_id,
-        "sha256": fingerprint(dataset_id),
-        "rewards_sha256": artifacts.hash_arrays(*(episode.rewards for episode in read_episodes(dataset_id))),
-        "env_spec": metadata.get("env_spec"),
-        "ref_min_score": metadata.get("ref_min_score"),
-        "ref_max_score": metadata.get("ref_max_score"),
-        "zest": {
-            stage: {key: value for key, value in facts.items() if key != "provenance"}
-            for stage, facts in metadata.get("zest", {}).items()
-        },
-    }
-
-
-def is_foreign(metadata: Mapping[str, Any]) -> bool:
-    """Whether a dataset's metadata or `describe` say that it was relabeled by frames that we did not render."""
-    return "frames" in metadata.get("zest", {}).get("relabel", {})
+    """As `Dataset`."""
+    with open_dataset(dataset_id) as ds:
+        return ds.describe()
 
 
 def kitchen_task(dataset_id: str) -> str | None:
-    """Return which kitchen task a dataset is of, None when its environment is another one."""
-    spec = json.loads(read_metadata(dataset_id).get("env_spec") or "{}")
-    name = spec.get("kwargs", {}).get("task")
-    return None if name is None or not str(spec.get("entry_point")).startswith("zest_rl.") else str(name)
+    """As `Dataset`."""
+    with open_dataset(dataset_id) as ds:
+        return ds.record.task
 
 
 def task_name(dataset_id: str) -> str:
-    """Return which kitchen task a dataset is of.
+    """As `Dataset`."""
+    with open_dataset(dataset_id) as ds:
+        return ds.kitchen_task()
 
-    Raises:
-        BadInput: its environment is not the kitchen.
-    """
-    name = kitchen_task(dataset_id)
-    if name is None:
-        spec = json.loads(read_metadata(dataset_id).get("env_spec") or "{}")
-        raise BadInput(
-            f"dataset {dataset_id} is of environment {spec.get('id')!r}; frames can be rendered for zest/Kitchen-v1 "
-            "only, so collect a dataset with `zest collect`; `zest relabel` alone takes any, see docs/any_dataset.md"
-        )
-    return name
+
+def is_foreign(metadata: Mapping[str, Any]) -> bool:
+    """As `DatasetRecord.is_foreign`."""
+    return DatasetRecord.from_metadata("", metadata).is_foreign

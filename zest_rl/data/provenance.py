@@ -1,0 +1,181 @@
+"""How a dataset was made: typed records of what its metadata say under "zest", and a run's ``meta.json`` after them.
+
+Up to three stages leave a record: ``collect`` (`CollectRecord`), ``recorded`` (steps per second of an imported dataset)
+and ``relabel`` (`RelabelRecord`). Fields that earlier versions did not write have their defaults.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, Self
+
+from zest_rl.errors import BadInput
+
+
+@dataclass(frozen=True)
+class CollectRecord:
+    """How a dataset was collected (`zest_rl.kitchen.collect`)."""
+
+    asked: Mapping[str, Any] = field(default_factory=dict)
+    """The arguments, but for names and numbers of processes."""
+    result: Mapping[str, Any] = field(default_factory=dict)
+    """What came of them: calibrated numbers, returns of the references, normalized return."""
+
+
+@dataclass(frozen=True)
+class ScorerRecord:
+    """What scored: a goal, an embedder, and how they are compared."""
+
+    goal: str
+    """Goal spec, see `zest_rl.rewards.goals`."""
+    embedder: str
+    features: str
+    similarity: str
+    precision: str
+    goal_share: float
+    """Share of the goals that were used."""
+    goal_sha256: str
+    embedder_sha256: str
+    views: Mapping[str, Any] | None = None
+    """Fields of `zest_rl.simulation.views.Views`, from which kitchen states were rendered; None for other frames."""
+    views_sha256: str | None = None
+    """Of all that such a frame depends on besides the state."""
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
+        """Read what `to_json` returned."""
+        hashes = {key: value for key, value in values.items() if key != "config"}
+        return cls(**{"precision": "auto", "goal_share": 1.0, **values["config"], **hashes})
+
+    def to_json(self) -> dict[str, Any]:
+        """Config and content hashes, as datasets hold them."""
+        names = ("goal", "embedder", "features", "similarity", "precision", "goal_share")
+        hashes = {"goal_sha256": self.goal_sha256, "embedder_sha256": self.embedder_sha256}
+        config = {name: getattr(self, name) for name in names}
+        if self.views is None:
+            return {"config": config, **hashes}
+        return {"config": {"views": dict(self.views), **config}, **hashes, "views_sha256": self.views_sha256}
+
+
+@dataclass(frozen=True)
+class RelabelRecord:
+    """How the rewards of a dataset were made of scores (`zest_rl.rewards.relabel`)."""
+
+    source: str
+    """Id of what was relabeled."""
+    source_sha256: str
+    """Its fingerprint: all that training may see of it, but no rewards."""
+    reward: Literal["level", "difference"]
+    """The score after each action, or its change."""
+    scorer: ScorerRecord
+    shuffle: int | None = None
+    """Seed of the null control, which gives every episode the scores of another one; None: its own."""
+    kept_goals: tuple[int, ...] | None = None
+    """Indices of the goals that were used; None: all."""
+    n_still_frames: int | None = None
+    """Frames without any change against their first frame."""
+    frames: Mapping[str, Any] | None = None
+    """Where frames come from that are not rendered from kitchen states (`zest_rl.sources.base.Frames.describe`)."""
+    frames_sha256: str | None = None
+    provenance: Mapping[str, Any] | None = None
+    """Command, versions and machine; left out of a run's ``meta.json``."""
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
+        """Read what `to_json` returned."""
+        kept = values.get("kept_goals")
+        scorer = ScorerRecord.from_json(values["scorer"])
+        return cls(**{**values, "scorer": scorer, "kept_goals": None if kept is None else tuple(kept)})
+
+    @property
+    def is_foreign(self) -> bool:
+        """Whether the frames were not rendered from kitchen states, so that no rollout can be scored online."""
+        return self.frames is not None
+
+    @property
+    def n_views(self) -> int:
+        """Number of views that scores were averaged over."""
+        return int(self.scorer.views["n_views"]) if self.scorer.views is not None else len((self.frames or {})["views"])
+
+    def to_json(self) -> dict[str, Any]:
+        """What a dataset's metadata hold of it."""
+        frames = {} if self.frames is None else {"frames": dict(self.frames), "frames_sha256": self.frames_sha256}
+        provenance = {} if self.provenance is None else {"provenance": dict(self.provenance)}
+        return {
+            "source": self.source,
+            "source_sha256": self.source_sha256,
+            **frames,
+            "reward": self.reward,
+            "shuffle": self.shuffle,
+            "kept_goals": None if self.kept_goals is None else list(self.kept_goals),
+            "scorer": self.scorer.to_json(),
+            "n_still_frames": self.n_still_frames,
+            **provenance,
+        }
+
+
+@dataclass(frozen=True)
+class DatasetRecord:
+    """Environment and scale of a dataset, and how it was made."""
+
+    id: str
+    env_spec: str | None
+    """Gymnasium EnvSpec as JSON; check it before anything is built from it (`zest_rl.data.env_specs`)."""
+    ref_min_score: float | None
+    """Ground-truth return that is 0 on the normalized scale."""
+    ref_max_score: float | None
+    """Ground-truth return that is 100 on the normalized scale."""
+    collect: CollectRecord | None
+    relabel: RelabelRecord | None
+    """None: its rewards are no ZeST scores."""
+    fps: float | None
+    """Steps per second of the recording that it was imported from, where that says so."""
+
+    @classmethod
+    def from_metadata(cls, dataset_id: str, metadata: Mapping[str, Any]) -> Self:
+        """Read Minari's metadata of a dataset.
+
+        Raises:
+            BadInput: a stage left another record than ours.
+        """
+        stages = metadata.get("zest") or {}
+        collect, relabel = stages.get("collect"), stages.get("relabel")
+        try:
+            return cls(
+                id=dataset_id,
+                env_spec=metadata.get("env_spec"),
+                ref_min_score=metadata.get("ref_min_score"),
+                ref_max_score=metadata.get("ref_max_score"),
+                collect=collect and CollectRecord(collect.get("asked", {}), collect.get("result", {})),
+                relabel=relabel and RelabelRecord.from_json(relabel),
+                fps=stages.get("recorded", {}).get("fps"),
+            )
+        except (KeyError, TypeError, AttributeError) as error:
+            raise BadInput(
+                f"the record of how {dataset_id} was made is not ours ({type(error).__name__}: {error}); make the "
+                "dataset again with this version"
+            ) from error
+
+    @classmethod
+    def from_description(cls, described: Mapping[str, Any]) -> Self:
+        """Read `zest_rl.data.reader.Dataset.describe`, which a run's ``meta.json`` holds as ``dataset``."""
+        return cls.from_metadata(described["id"], described)
+
+    @property
+    def env(self) -> dict[str, Any]:
+        """The EnvSpec's fields; empty without one."""
+        spec: dict[str, Any] = json.loads(self.env_spec or "{}")
+        return spec
+
+    @property
+    def task(self) -> str | None:
+        """Which kitchen task it is of, None when its environment is another one."""
+        name = self.env.get("kwargs", {}).get("task")
+        return None if name is None or not str(self.env.get("entry_point")).startswith("zest_rl.") else str(name)
+
+    @property
+    def is_foreign(self) -> bool:
+        """Whether it was relabeled by frames that were not rendered from kitchen states."""
+        return self.relabel is not None and self.relabel.is_foreign
