@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -15,21 +16,15 @@ import zest_rl
 PACKAGE = Path(zest_rl.__file__).parent
 ROOT = PACKAGE.parent
 
-ORDER = (
-    "load_order", "errors", "types", "artifacts", "ray_engine", "parallel", "tasks", "observations", "data",
-    "data_writer", "metrics", "quality", "envs", "arm", "experts", "collect",
-    "rendering", "videos", "images", "goals", "embedders", "frames", "embed", "scores", "scorer", "looks", "selection",
-    "footage", "relabel", "sources", "frame_scorer", "relabel_frames", "export", "agents",
-    "checkpoints", "distributed", "training", "adoption", "evaluation", "report", "panels", "comparison", "inspection",
-    "inspection_page", "candidates", "multistep",
-    "cli.ui", "cli.recipes", "cli", "cli.doctor", "cli.collect", "cli.relabel", "cli.inspect", "cli.select_footage",
-    "cli.select", "cli.follow", "cli.export", "cli.train", "cli.adopt", "cli.evaluate", "cli.report", "cli.plans",
-    "cli.studies",
-    "cli.reproduce",
+ROOMS = (
+    "errors", "types", "runtime", "metrics", "data", "simulation", "kitchen", "sources", "embedders", "rewards",
+    "export", "agents", "training", "evaluation", "analysis", "report", "cli",
 )  # fmt: skip
-"""The pipeline: a module imports only what stands before it. A folder is listed once, its files share the place."""
+"""The pipeline: a module imports only from its own room and from those before it."""
 
-MAY_READ_GROUND_TRUTH = ("data", "panels", "comparison", "inspection", "export.transitions")
+MAY_READ_GROUND_TRUTH = (
+    "data.reader", "export.transitions", "analysis.inspection", "report.comparison", "report.panels",
+)  # fmt: skip
 """`read_ground_truth` and its only callers, which make reports or copies: nothing that chooses or trains anything."""
 
 HEAVY = ("torch", "transformers", "mujoco", "minari", "timm", "open_clip", "gymnasium", "matplotlib", "scipy", "h5py")
@@ -44,11 +39,9 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def place(name: str) -> int | None:
-    """Index of a module in `ORDER`, by its own name or by that of the folder it is in; None when not listed."""
-    parts = name.split(".")
-    names = [".".join(parts[:n]) for n in range(len(parts), 0, -1)]
-    return next((ORDER.index(candidate) for candidate in names if candidate in ORDER), None)
+def room(name: str) -> str:
+    """First part of a module's name: a folder, or a file beside them."""
+    return name.split(".")[0]
 
 
 def imported(tree: ast.AST) -> Iterator[str]:
@@ -66,31 +59,36 @@ def own_imports(tree: ast.AST) -> Iterator[str]:
     for name in imported(tree):
         if name.startswith("zest_rl."):
             below = name.removeprefix("zest_rl.")
-            is_module = (PACKAGE / below.replace(".", "/")).with_suffix(".py").exists()
-            is_module = is_module or (PACKAGE / below.replace(".", "/") / "__init__.py").exists()
-            owner = below if is_module else below.rpartition(".")[0]
+            owner = below if below in MODULES else below.rpartition(".")[0]
             if owner:  # `from zest_rl import __version__` is of the package itself
                 yield owner
 
 
-def test_every_module_has_its_place_in_the_pipeline() -> None:
-    unlisted = [module_name(path) for path in SOURCES if module_name(path) and place(module_name(path)) is None]
-    assert not unlisted, f"put them into ORDER where the pipeline needs them: {unlisted}"
+MODULES = {module_name(path): path for path in SOURCES}
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=module_name)
-def test_a_module_imports_only_what_stands_before_it(path: Path) -> None:
-    name = module_name(path)
+def test_the_package_is_its_rooms_and_three_files() -> None:
+    entries = [path for path in PACKAGE.iterdir() if path.name not in ("__pycache__", "py.typed")]
+    assert sorted(path.name for path in entries if path.is_file()) == ["__init__.py", "errors.py", "types.py"]
+    assert {path.stem for path in entries} - {"__init__"} == set(ROOMS)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_module_imports_only_from_its_own_room_and_those_before_it(name: str) -> None:
+    imports = list(own_imports(ast.parse(MODULES[name].read_text())))
     if not name:
-        assert not list(own_imports(ast.parse(path.read_text()))), "zest_rl/__init__.py imports nothing of the package"
+        assert not imports, "zest_rl/__init__.py imports nothing of the package"
         return
-    here = place(name)
-    assert here is not None
-    for other in own_imports(ast.parse(path.read_text())):
-        there = place(other)
-        assert there is not None, f"{name} imports {other}, which is not in ORDER"
-        same_folder = there == here and name.split(".")[0] == other.split(".")[0]
-        assert there < here or same_folder, f"{name} imports {other}, which stands after it"
+    allowed = ROOMS[: ROOMS.index(room(name)) + 1]
+    assert not [other for other in imports if room(other) not in allowed], f"{room(name)} comes before them"
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    graph = {name: set(own_imports(ast.parse(path.read_text()))) - {name} for name, path in MODULES.items()}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"a circle: {' ← '.join(error.args[1])}")
 
 
 def test_no_file_is_a_drawer_for_odds_and_ends() -> None:
@@ -110,7 +108,7 @@ def test_only_the_env_module_imports_gymnasium_robotics() -> None:
         for name in imported(ast.parse(path.read_text()))
         if name.split(".")[0] == "gymnasium_robotics"
     }
-    assert users == {"envs"}
+    assert users == {"kitchen.env"}
 
 
 @pytest.mark.parametrize("folder", RECIPE_FOLDERS)
@@ -132,12 +130,12 @@ def test_the_ground_truth_of_a_dataset_is_read_only_where_reports_are_made() -> 
     assert readers == set(MAY_READ_GROUND_TRUTH)
     for path in SOURCES:
         if "infos/gt" in path.read_text():
-            assert module_name(path) in ("data", "data_writer"), "it is read through `read_ground_truth` alone"
+            assert room(module_name(path)) == "data", "it is read through `read_ground_truth` alone"
 
 
 def test_ground_truth_read_from_states_is_for_judging_alone() -> None:
     users = {module_name(path) for path in SOURCES if "progress_of" in path.read_text()}
-    assert users == {"envs", "candidates"}
+    assert users == {"kitchen.env", "analysis.frame_selection"}
     importers = {module_name(path) for path in SOURCES if "zest_rl.analysis.frame_selection import" in path.read_text()}
     assert importers == {"cli.select"}
 
