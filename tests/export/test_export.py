@@ -23,8 +23,9 @@ from zest_rl import cli
 from zest_rl.data import reader
 from zest_rl.data.observations import is_numbers
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.export import Rewards, export, transitions
+from zest_rl.export import export, transitions
 from zest_rl.export.lerobot import DATA_FILE
+from zest_rl.export.transitions import shape_rewards
 from zest_rl.rewards.relabel import relabel
 from zest_rl.rewards.scorer import ScorerConfig
 from zest_rl.simulation.views import Views
@@ -227,7 +228,7 @@ def test_progress_needs_scores_and_takes_no_shape(collected: str, tmp_path: Path
     with pytest.raises(BadInput, match="relabel it with `zest relabel`"):
         export(collected, "lerobot-progress", tmp_path / "x")
     with pytest.raises(BadInput, match="leave --shape and --normalise out"):
-        export(collected, "lerobot-progress", tmp_path / "x", Rewards("difference"))
+        export(collected, "lerobot-progress", tmp_path / "x", shape="difference")
     assert not (tmp_path / "x").exists()
 
 
@@ -258,28 +259,28 @@ def test_rewards_take_the_shape_that_is_asked_for() -> None:
     rewards = [np.array([0.0, 1.0, 3.0], np.float32), np.array([2.0, -1.0], np.float32)]
 
     def of(*arguments: Any) -> list[list[float]]:
-        return [values.tolist() for values in Rewards(*arguments).of(rewards, [0.0, 1.5])]
+        return [values.tolist() for values in shape_rewards(rewards, [0.0, 1.5], *arguments)]
 
     assert of() == [[0, 1, 3], [2, -1]]
     assert of("difference") == [[0, 1, 2], [0.5, -3]]
     assert of("terminal") == [[0, 0, 3], [0, -1]]
     assert of("step", True) == [[0.25, 0.5, 1], [0.75, 0]]
     assert of("terminal", True) == [[0, 0, 1], [0, 0]]
-    assert all(values.dtype == np.float32 for values in Rewards("terminal", True).of(rewards, [0.0, 0.0]))
+    assert all(values.dtype == np.float32 for values in shape_rewards(rewards, [0.0, 0.0], "terminal", True))
     with pytest.raises(BadInput, match="unknown shape of rewards 'last'"):
-        Rewards("last")  # type: ignore[arg-type]
+        shape_rewards(rewards, [0.0, 0.0], "last")  # type: ignore[arg-type]
     with pytest.raises(BadInput, match="all equal cannot be normalised"):
-        Rewards("step", True).of([np.ones(3, np.float32)], [0.0])
+        shape_rewards([np.ones(3, np.float32)], [0.0], normalise=True)
 
 
 def test_differences_are_those_of_relabeling(scored: str, collected: str) -> None:
     config = ScorerConfig(Views("micro", n_views=1, size=96, tolerance=0.05), "same-scene", features="raw")
     level = relabel(collected, config).dataset_id
     difference = relabel(collected, config, reward="difference").dataset_id
-    for one, other in zip(transitions(level, Rewards("difference")), transitions(difference), strict=True):
+    for one, other in zip(transitions(level, shape="difference"), transitions(difference), strict=True):
         np.testing.assert_allclose(one["rewards"], other["rewards"], atol=1e-6)
     with pytest.raises(BadInput, match="are differences already"):
-        transitions(difference, Rewards("difference"))
+        transitions(difference, shape="difference")
 
 
 @pytest.mark.parametrize("to", ["npz", "d4rl", "robomimic"])
@@ -302,7 +303,7 @@ def test_an_episode_that_ended_by_itself_is_no_timeout(collected: str, to: str, 
 @pytest.mark.parametrize("to", ["d4rl", "d3rlpy"])
 def test_a_format_that_would_lose_the_rewards_is_refused(collected: str, to: str, tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="leaves out the transition at a time limit"):
-        export(collected, to, tmp_path / "x", Rewards("terminal"))  # type: ignore[arg-type]
+        export(collected, to, tmp_path / "x", shape="terminal")  # type: ignore[arg-type]
     assert not (tmp_path / "x").exists()
 
 

@@ -14,7 +14,7 @@ import pytest
 from conftest import Recorded
 from d3rlpy.dataset import InfiniteBuffer, ReplayBuffer
 
-from zest_rl.export import Rewards, export, to_d3rlpy
+from zest_rl.export import export, to_d3rlpy
 
 
 @pytest.fixture(params=["file", "to_d3rlpy"])
@@ -71,7 +71,7 @@ def test_scores_and_ground_truth_lie_beside_what_d3rlpy_reads(exports: Path, rec
 
 
 def test_other_shapes_of_the_rewards_reach_the_buffer(dataset_id: str, recorded: list[Recorded]) -> None:
-    for episode, own in zip(to_d3rlpy(dataset_id, Rewards("difference")).episodes, recorded, strict=True):
+    for episode, own in zip(to_d3rlpy(dataset_id, shape="difference").episodes, recorded, strict=True):
         np.testing.assert_allclose(episode.rewards[:, 0], np.diff(own.scores), atol=1e-6)
 
 

@@ -10,15 +10,6 @@ import tyro
 
 from zest_rl.cli.ui import Ui
 
-SUFFIXES = {
-    "npz": "npz",
-    "d4rl": "d4rl.hdf5",
-    "robomimic": "robomimic.hdf5",
-    "d3rlpy": "d3rlpy.h5",
-    "torchrl": "torchrl",
-    "lerobot": "lerobot",
-    "lerobot-progress": "progress.parquet",
-}
 NEXT = {
     "npz": "python -c \"import numpy; print({{k: v.shape for k, v in numpy.load('{path}').items()}})\"",
     "d4rl": "python -c \"import h5py; print({{k: v.shape for k, v in h5py.File('{path}').items()}})\"",
@@ -58,11 +49,11 @@ class Config:
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Read, shape, write."""
-    from zest_rl.export import Rewards, export
+    from zest_rl.export import export
 
-    name = config.dataset.split("/")[-1]
-    path = config.output or Path(f"{name}.{SUFFIXES[config.to]}")
-    written = export(config.dataset, config.to, path, Rewards(config.shape, config.normalise), config.fps)
+    written = export(
+        config.dataset, config.to, config.output, shape=config.shape, normalise=config.normalise, fps=config.fps
+    )
     if written.left_out:
         ui.warn(f"left out, as they are pictures or text: {', '.join(written.left_out)}")
     return {
@@ -72,5 +63,5 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "arrays": sorted(written.arrays),
         "left_out": list(written.left_out),
         "bytes": written.n_bytes,
-        "next": NEXT[config.to].format(path=written.path, name=name),
+        "next": NEXT[config.to].format(path=written.path, name=config.dataset.split("/")[-1]),
     }

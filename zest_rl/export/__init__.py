@@ -23,42 +23,48 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from zest_rl.data.reader import open_dataset
 from zest_rl.errors import BadInput, nearest
 from zest_rl.export import d3rlpy, flat, lerobot, robomimic, torchrl
 from zest_rl.export.d3rlpy import to_d3rlpy
 from zest_rl.export.torchrl import to_torchrl
 from zest_rl.export.transitions import (
-    AS_RECORDED,
-    Contents,
-    Rewards,
     Shape,
+    TransitionDataset,
     Transitions,
-    read,
-    read_scores,
+    read_progress,
+    read_transitions,
     transitions,
 )
 from zest_rl.runtime import artifacts
 
-__all__ = [
-    "AS_RECORDED", "Exported", "Format", "Rewards", "Shape", "Transitions", "export", "to_d3rlpy", "to_torchrl",
-    "transitions",
-]  # fmt: skip
+__all__ = ["Exported", "Format", "Shape", "Transitions", "export", "to_d3rlpy", "to_torchrl", "transitions"]
 
 Format = Literal["npz", "d4rl", "robomimic", "d3rlpy", "torchrl", "lerobot", "lerobot-progress"]
 
-WRITERS: dict[str, Callable[[Path, Contents], None]] = {
-    "npz": flat.write_npz,
-    "d4rl": flat.write_d4rl,
-    "robomimic": robomimic.write,
-    "d3rlpy": d3rlpy.write,
-    "torchrl": torchrl.write,
-    "lerobot": lerobot.write,
-    "lerobot-progress": lerobot.write_progress,
+
+@dataclass(frozen=True)
+class _Writer:
+    """How a format is written."""
+
+    write: Callable[[Path, TransitionDataset], None]
+    suffix: str
+    """Of the file or folder."""
+    is_folder: bool = False
+    """`write` fills an empty folder."""
+    loses_last_step: str | None = None
+    """Who leaves out the last transition of an episode that a time limit ended; None: nobody."""
+
+
+WRITERS = {
+    "npz": _Writer(flat.write_npz, "npz"),
+    "d4rl": _Writer(flat.write_d4rl, "d4rl.hdf5", loses_last_step="D4RL's loader"),
+    "robomimic": _Writer(robomimic.write, "robomimic.hdf5"),
+    "d3rlpy": _Writer(d3rlpy.write, "d3rlpy.h5", loses_last_step="d3rlpy's Q-learning"),
+    "torchrl": _Writer(torchrl.write, "torchrl", is_folder=True),
+    "lerobot": _Writer(lerobot.write, "lerobot", is_folder=True),
+    "lerobot-progress": _Writer(lerobot.write_progress, "progress.parquet"),
 }
-FOLDERS = ("torchrl", "lerobot")
-"""Formats of several files; their writers fill an empty folder."""
-WITHOUT_LAST_STEP = {"d4rl": "D4RL's loader", "d3rlpy": "d3rlpy's Q-learning"}
-"""Who leaves out the last transition of an episode that a time limit ended."""
 
 
 @dataclass(frozen=True)
@@ -75,14 +81,23 @@ class Exported:
     """Entries of the observations that are no numbers: pictures and text."""
 
 
-def export(dataset_id: str, to: Format, path: Path, rewards: Rewards = AS_RECORDED, fps: int | None = None) -> Exported:
-    """Write a dataset in another format, atomically.
+def export(
+    dataset_id: str,
+    to: Format = "npz",
+    output: Path | None = None,
+    *,
+    shape: Shape = "step",
+    normalise: bool = False,
+    fps: int | None = None,
+) -> Exported:
+    """Write a dataset in another format, atomically; every file of it is read and hashed once.
 
     Args:
         dataset_id: any dataset with numbers among its observations; of pictures alone for ``lerobot-progress``.
         to: the format.
-        path: the file, or the folder (`FOLDERS`); it must not exist.
-        rewards: how the dataset's rewards are handed on.
+        output: the file, or the folder, which must not exist; None: DATASET.FORMAT in the current folder.
+        shape: the rewards as they are, their change, or the last one alone.
+        normalise: shift and scale the rewards to [0, 1] over the dataset.
         fps: steps per second, which LeRobot alone records; None: as the dataset was recorded, if that is known, else
             the kitchen's.
 
@@ -92,30 +107,28 @@ def export(dataset_id: str, to: Format, path: Path, rewards: Rewards = AS_RECORD
     """
     if to not in WRITERS:
         raise BadInput(f"unknown format {to!r}; {nearest(to, WRITERS)}")
+    writer = WRITERS[to]
+    path = output or Path(f"{dataset_id.split('/')[-1]}.{writer.suffix}")
     if path.exists():
         raise BadInput(f"{path} exists; delete it, or choose another --output")
-    if to == "lerobot-progress" and rewards != AS_RECORDED:
+    if to == "lerobot-progress" and (shape, normalise) != ("step", False):
         raise BadInput("lerobot-progress holds scores of frames and no rewards; leave --shape and --normalise out")
-    contents = read_scores(dataset_id) if to == "lerobot-progress" else read(dataset_id, rewards)
-    if (
-        to in WITHOUT_LAST_STEP
-        and rewards.shape == "terminal"
-        and any(one["timeouts"].any() for one in contents.episodes)
-    ):
+    with open_dataset(dataset_id) as ds:
+        data = read_progress(ds) if to == "lerobot-progress" else read_transitions(ds, shape, normalise)
+    if writer.loses_last_step and shape == "terminal" and any(episode["timeouts"].any() for episode in data.episodes):
         raise BadInput(
-            f"{WITHOUT_LAST_STEP[to]} leaves out the transition at a time limit, which holds the only reward of "
+            f"{writer.loses_last_step} leaves out the transition at a time limit, which holds the only reward of "
             "'terminal'; export 'step' or 'difference', or to npz"
         )
-    writer = partial(lerobot.write, fps=fps) if to == "lerobot" else WRITERS[to]
-    size = sum(array.nbytes for episode in contents.episodes for array in episode.values())
+    write = partial(lerobot.write, fps=fps) if to == "lerobot" else writer.write
+    size = sum(array.nbytes for episode in data.episodes for array in episode.values())
     artifacts.check_free_space(path.parent, 2 * size)
-    if to in FOLDERS:
+    if writer.is_folder:
         with artifacts.lock(path), artifacts.staged_folder(path) as staging:
-            writer(staging, contents)
+            write(staging, data)
     else:
         with artifacts.atomic_path(path) as temporary:
-            writer(temporary, contents)
+            write(temporary, data)
     files = [file for file in (path, *path.rglob("*")) if file.is_file()]
     n_bytes = sum(file.stat().st_size for file in files)
-    arrays, left_out = tuple(contents.episodes[0]), tuple(contents.about["left_out"])
-    return Exported(path, len(contents.episodes), len(contents), arrays, n_bytes, left_out)
+    return Exported(path, len(data.episodes), len(data), tuple(data.episodes[0]), n_bytes, data.left_out)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import h5py
 
 from zest_rl.errors import BadInput
-from zest_rl.export.transitions import AS_RECORDED, Contents, Rewards, Transitions, transitions
+from zest_rl.export.transitions import Shape, TransitionDataset, Transitions, transitions
 
 if TYPE_CHECKING:
     import d3rlpy
@@ -45,19 +45,19 @@ def fields(episode: Transitions) -> dict[str, object]:
     }
 
 
-def write(path: Path, contents: Contents) -> None:
+def write(path: Path, data: TransitionDataset) -> None:
     """Write `NAME_I` of every episode; what is not in ``columns``, such as ``zest_score_I``, d3rlpy passes over."""
     with h5py.File(path, "w") as file:
-        file["columns"] = list(fields(contents.episodes[0]))
-        file["num_episodes"] = len(contents.episodes)
+        file["columns"] = list(fields(data.episodes[0]))
+        file["num_episodes"] = len(data.episodes)
         file["version"] = VERSION
-        for i, episode in enumerate(contents.episodes):
+        for i, episode in enumerate(data.episodes):
             for name, values in {**episode, **fields(episode)}.items():
                 file[f"{name}_{i}"] = values
-        file.attrs["about"] = json.dumps(contents.about)
+        file.attrs["about"] = json.dumps(data.about)
 
 
-def to_d3rlpy(dataset_id: str, rewards: Rewards = AS_RECORDED) -> d3rlpy.dataset.ReplayBuffer:
+def to_d3rlpy(dataset_id: str, *, shape: Shape = "step", normalise: bool = False) -> d3rlpy.dataset.ReplayBuffer:
     """Read a dataset as a d3rlpy `ReplayBuffer`, without a file; arguments and errors as in `transitions`.
 
     Raises:
@@ -65,4 +65,5 @@ def to_d3rlpy(dataset_id: str, rewards: Rewards = AS_RECORDED) -> d3rlpy.dataset
     """
     from d3rlpy.dataset import Episode, create_infinite_replay_buffer
 
-    return create_infinite_replay_buffer([Episode(**fields(one)) for one in transitions(dataset_id, rewards)])
+    episodes = transitions(dataset_id, shape=shape, normalise=normalise)
+    return create_infinite_replay_buffer([Episode(**fields(episode)) for episode in episodes])

@@ -8,18 +8,18 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from zest_rl.export.transitions import Contents
+from zest_rl.export.transitions import TransitionDataset
 
 
-def write_npz(path: Path, contents: Contents) -> None:
+def write_npz(path: Path, data: TransitionDataset) -> None:
     """Write the arrays by the names of `transitions`, and ``about`` as JSON."""
     with path.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, about=np.array(json.dumps(contents.about)), **contents.flat)
+        np.savez_compressed(file, allow_pickle=False, about=np.array(json.dumps(data.about)), **data.flat)
 
 
-def write_d4rl(path: Path, contents: Contents) -> None:
+def write_d4rl(path: Path, data: TransitionDataset) -> None:
     """Write the same arrays at the root of an HDF5 file, and ``about`` as an attribute."""
     with h5py.File(path, "w") as file:
-        for name, values in contents.flat.items():
+        for name, values in data.flat.items():
             file.create_dataset(name, data=values, compression="gzip")
-        file.attrs["about"] = json.dumps(contents.about)
+        file.attrs["about"] = json.dumps(data.about)

@@ -21,8 +21,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.export.transitions import Contents, Transitions, check_continuous
+from zest_rl.export.transitions import TransitionDataset, Transitions
 from zest_rl.kitchen.tasks import TASKS
 from zest_rl.runtime import artifacts
 
@@ -40,8 +41,8 @@ Columns = dict[str, NDArray[Any]]
 """Equally long arrays (T,) or (T, dim) by LeRobot's names."""
 
 
-def write(folder: Path, contents: Contents, fps: int | None = None) -> None:
-    """Write a dataset, with the side-car when the contents have scores.
+def write(folder: Path, data: TransitionDataset, fps: int | None = None) -> None:
+    """Write a dataset, with the side-car when there are scores.
 
     Without `fps` the steps per second are those that the dataset was recorded with, if it says so, else the kitchen's.
 
@@ -49,31 +50,31 @@ def write(folder: Path, contents: Contents, fps: int | None = None) -> None:
         BadInput: `fps` is below 1, or actions are whole numbers.
         ZestError: pyarrow is not installed.
     """
-    check_continuous(contents, "LeRobot")
+    data.check_continuous("LeRobot")
     if fps is None:
-        fps = max(1, round((contents.about["zest"] or {}).get("recorded", {}).get("fps", FPS)))
+        fps = max(1, round(FPS if data.record.fps is None else data.record.fps))
     if fps < 1:
         raise BadInput(f"fps must be at least 1, got {fps}; give the steps per second of the robot")
-    flat = contents.flat
+    flat = data.flat
     lengths = np.bincount(flat["episode"])
     starts = np.cumsum(lengths) - lengths
     columns = _columns(flat, starts, fps)
     rows = [slice(start, start + length) for start, length in zip(starts.tolist(), lengths.tolist(), strict=True)]
-    task = _task(contents.about)
+    task = _task(data.record)
     for name in (DATA_FILE, EPISODES_FILE):
         (folder / name).parent.mkdir(parents=True)
     _write_parquet(folder / DATA_FILE, _table(columns), rows)
     _write_parquet(folder / EPISODES_FILE, _episodes(columns, rows, task))
     _write_parquet(folder / TASKS_FILE, _tasks(task))
-    if contents.scores is not None:
-        write_progress(folder / PROGRESS_FILE, contents)
+    if data.scores is not None:
+        write_progress(folder / PROGRESS_FILE, data)
     artifacts.write_json(folder / "meta/stats.json", {name: _stats(values) for name, values in columns.items()})
-    artifacts.write_json(folder / "meta/zest.json", contents.about)
+    artifacts.write_json(folder / "meta/zest.json", data.about)
     info = {
         "codebase_version": "v3.0",
         "robot_type": None,
         "total_episodes": len(rows),
-        "total_frames": len(contents),
+        "total_frames": len(data),
         "total_tasks": 1,
         "chunks_size": 1000,
         "data_files_size_in_mb": 100,
@@ -90,16 +91,16 @@ def write(folder: Path, contents: Contents, fps: int | None = None) -> None:
     artifacts.write_json(folder / "meta/info.json", info)
 
 
-def write_progress(path: Path, contents: Contents) -> None:
+def write_progress(path: Path, data: TransitionDataset) -> None:
     """Write the side-car alone: index, episode_index, frame_index, progress_sparse, and zest_score as it is.
 
     Raises:
         ZestError: pyarrow is not installed.
     """
-    assert contents.scores is not None
-    scores = np.concatenate([score[:-1] for score in contents.scores])
+    assert data.scores is not None
+    scores = np.concatenate([score[:-1] for score in data.scores])
     low, size = scores.min(), np.ptp(scores)
-    lengths = [len(score) - 1 for score in contents.scores]
+    lengths = [len(score) - 1 for score in data.scores]
     _write_parquet(
         path,
         _table(
@@ -141,11 +142,10 @@ def _columns(flat: Transitions, starts: NDArray[Any], fps: int) -> Columns:
     return columns | {name: flat[key] for name, key in extras.items() if key in flat}
 
 
-def _task(about: dict[str, Any]) -> str:
+def _task(record: DatasetRecord) -> str:
     """The task in words, as policies that read language are told it."""
-    spec = about["env_spec"] or {}
-    own = TASKS.get(spec.get("kwargs", {}).get("task"))
-    return own.goal_text if own else str(spec.get("id") or about["dataset"])
+    task = TASKS.get(record.env.get("kwargs", {}).get("task"))
+    return task.goal_text if task else str(record.env.get("id") or record.id)
 
 
 def _width(values: NDArray[Any]) -> int:

@@ -8,13 +8,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from zest_rl.export.transitions import Contents, check_continuous
+from zest_rl.export.transitions import TransitionDataset
 
 VALID_SHARE = 0.1
 """Of the episodes, for the mask ``valid``."""
 
 
-def write(path: Path, contents: Contents) -> None:
+def write(path: Path, data: TransitionDataset) -> None:
     """Write ``data/demo_I`` with ``obs/flat`` and ``next_obs/flat``; ``dones`` are terminals and timeouts alike.
 
     One episode alone is in the mask ``train``, and ``valid`` is empty, which robomimic's SequenceDataset takes.
@@ -22,8 +22,8 @@ def write(path: Path, contents: Contents) -> None:
     Raises:
         BadInput: actions are whole numbers.
     """
-    check_continuous(contents, "robomimic")
-    episodes = contents.episodes
+    data.check_continuous("robomimic")
+    episodes = data.episodes
     names = [f"demo_{i}" for i in range(len(episodes))]
     with h5py.File(path, "w") as file:
         group = file.create_group("data")
@@ -37,11 +37,11 @@ def write(path: Path, contents: Contents) -> None:
             demo.create_dataset("dones", data=(episode["terminals"] | episode["timeouts"]).astype(np.int64))
             for key in sorted(episode.keys() - {"observations", "next_observations", "actions", "rewards"}):
                 demo.create_dataset(key, data=episode[key])
-        group.attrs["total"] = len(contents)
-        spec = contents.about["env_spec"] or {"id": "unknown"}
+        group.attrs["total"] = len(data)
+        spec = data.record.env or {"id": "unknown"}
         env = {"env_name": spec["id"], "type": 2, "env_kwargs": spec.get("kwargs", {})}  # 2: a Gym environment
         group.attrs["env_args"] = json.dumps(env)
-        group.attrs["about"] = json.dumps(contents.about)
+        group.attrs["about"] = json.dumps(data.about)
         n_valid = max(1, round(VALID_SHARE * len(names))) if len(names) > 1 else 0
         chosen = set(np.random.default_rng(0).permutation(len(names))[:n_valid].tolist())
         for mask, members in (("valid", chosen), ("train", set(range(len(names))) - chosen)):

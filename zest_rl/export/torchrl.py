@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from zest_rl.export.transitions import AS_RECORDED, Contents, Rewards, read
+from zest_rl.data.reader import open_dataset
+from zest_rl.export.transitions import Shape, TransitionDataset, read_transitions
 from zest_rl.runtime import artifacts
 
 if TYPE_CHECKING:
@@ -27,9 +28,9 @@ if TYPE_CHECKING:
 TYPE = "<class 'tensordict._td.TensorDict'>"
 
 
-def nested(contents: Contents) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
+def nested(data: TransitionDataset) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
     """Return the arrays at the root and those under ``next``."""
-    flat = contents.flat
+    flat = data.flat
     root = {"observation": flat["observations"], "action": flat["actions"], "episode": flat["episode"]}
     after = {
         "observation": flat["next_observations"],
@@ -45,13 +46,13 @@ def nested(contents: Contents) -> tuple[dict[str, NDArray[Any]], dict[str, NDArr
     return root, {name: values if values.ndim == 2 else values[:, None] for name, values in after.items()}
 
 
-def write(folder: Path, contents: Contents) -> None:
+def write(folder: Path, data: TransitionDataset) -> None:
     """Write one raw little-endian ``KEY.memmap`` per array and ``meta.json``; ``about.json`` beside them."""
-    root, after = nested(contents)
+    root, after = nested(data)
     (folder / "next").mkdir()
     _write_level(folder, root, {"next": {"type": "TensorDict"}})
     _write_level(folder / "next", after, {})
-    artifacts.write_json(folder / "about.json", contents.about)
+    artifacts.write_json(folder / "about.json", data.about)
 
 
 def _write_level(folder: Path, arrays: dict[str, NDArray[Any]], below: dict[str, Any]) -> None:
@@ -65,7 +66,7 @@ def _write_level(folder: Path, arrays: dict[str, NDArray[Any]], below: dict[str,
     (folder / "meta.json").write_text(json.dumps(meta))
 
 
-def to_torchrl(dataset_id: str, rewards: Rewards = AS_RECORDED) -> TensorDict:
+def to_torchrl(dataset_id: str, *, shape: Shape = "step", normalise: bool = False) -> TensorDict:
     """Read a dataset as a TensorDict of batch size (N,), without a file; arguments and errors as in `transitions`.
 
     Raises:
@@ -74,7 +75,8 @@ def to_torchrl(dataset_id: str, rewards: Rewards = AS_RECORDED) -> TensorDict:
     import torch
     from tensordict import TensorDict
 
-    root, after = nested(read(dataset_id, rewards))
+    with open_dataset(dataset_id) as ds:
+        root, after = nested(read_transitions(ds, shape, normalise))
     tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in root.items()}
     tensors["next"] = {name: torch.from_numpy(array) for name, array in after.items()}
     return TensorDict(tensors, batch_size=[len(root["episode"])])
