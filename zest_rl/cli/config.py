@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
-import io
 import os
 import tomllib
 import types
 from collections.abc import Mapping, Sequence
-from contextlib import redirect_stderr
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    NoReturn,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveTypeInfo
 
 from zest_rl.errors import BadInput, nearest
 
@@ -37,15 +51,15 @@ def read_recipe(path: Path) -> dict[str, Any]:
     """
     from zest_rl.runtime.artifacts import shipped  # brings NumPy, which `zest --help` does without
 
-    candidates = [path]
+    places = [path]
     if path.parts[:1] and path.parts[0] in RECIPE_FOLDERS:
-        candidates.append(shipped(path.parts[0]).joinpath(*path.parts[1:]))
-    found = next((candidate for candidate in candidates if candidate.is_file()), None)
-    if found is None:
-        others = {other.name for candidate in candidates for other in candidate.parent.glob("*.toml")}
+        places.append(shipped(path.parts[0]).joinpath(*path.parts[1:]))
+    file = next((place for place in places if place.is_file()), None)
+    if file is None:
+        others = {other.name for place in places for other in place.parent.glob("*.toml")}
         raise BadInput(f"there is no recipe {path}; {nearest(path.name, others)}")
     try:
-        return tomllib.loads(found.read_text(encoding="utf-8"))
+        return tomllib.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
         raise BadInput(f"recipe {path} is not TOML: {error}") from error
 
@@ -69,12 +83,10 @@ def load_config(config_class: type[C], recipe: Mapping[str, Any], source: str) -
         BadInput: unknown keys, wrong types or missing required keys (the message lists all of them), or the config
             refuses a value.
     """
-    values, problems = _check(config_class, recipe)
-    problems += [
-        f"{_flag(field.name)!r} is required"
-        for field in dataclasses.fields(config_class)
-        if _default(field) is dataclasses.MISSING and _flag(field.name) not in map(_flag, recipe)
-    ]
+    values, problems = _read_table(config_class, recipe)
+    given = {_hyphenated(key) for key in recipe}
+    required = [_hyphenated(field) for field, argument in _arguments(config_class).items() if argument.is_required]
+    problems += [f"{key!r} is required" for key in required if key not in given]
     _refuse(problems, source)
     try:
         return config_class(**values)
@@ -88,99 +100,136 @@ def parse_config(config_class: type[C], argv: Sequence[str], verb: str) -> tuple
     A recipe may carry ``verb = "collect"``, which must then be `verb` (``"train bc"`` for a verb with sub-verbs).
 
     Raises:
-        BadInput: a flag or recipe key is unknown, missing or of the wrong type, or the config refuses a value.
+        BadInput: flags or recipe keys are unknown, missing or of the wrong type (the message lists all of them), or
+            the config refuses a value.
         SystemExit: code 0, after ``--help`` was printed.
     """
-    flags, recipe_path, as_json = split_common_flags(argv)
+    given, unknown = _split_words(config_class, argv)
+    as_json, asks_for_help, recipe_path = (given.pop(flag, None) for flag in ("--json", "--help", "--recipe"))
     values: dict[str, Any] = {}
+    if recipe_path == "":
+        raise BadInput("--recipe needs a file: --recipe FILE.toml")
     if recipe_path is not None:
-        recipe = read_recipe(recipe_path)
+        recipe = read_recipe(Path(recipe_path))
         meant = recipe.pop("verb", verb)
         if meant != verb:
             raise BadInput(f"recipe {recipe_path} is for `zest {meant}`, not for `zest {verb}`")
-        values, problems = _check(config_class, recipe)
+        values, problems = _read_table(config_class, recipe)
         _refuse(problems, f"recipe {recipe_path}")
-    return _parse_flags(config_class, flags, verb, values), as_json
+    if asks_for_help:
+        _print_help(config_class, verb, values)
+    flags, problems = _read_words(config_class, given)
+    values |= flags
+    required = {field: argument.name for field, argument in _arguments(config_class).items() if argument.is_required}
+    problems += [f"{name} is required" for field, name in required.items() if field not in values | given]
+    _refuse([*unknown, *problems], f"zest {verb}")
+    return config_class(**values), bool(as_json)
 
 
-def split_common_flags(argv: Sequence[str]) -> tuple[list[str], Path | None, bool]:
-    """Take ``--recipe FILE`` and ``--json`` out of `argv`; return the rest, the recipe's path, whether JSON is wanted.
+class _Argument(NamedTuple):
+    """A field of a config, as its user sees it."""
 
-    Raises:
-        BadInput: ``--recipe`` has no file.
-    """
-    rest: list[str] = []
-    recipe: Path | None = None
-    as_json = False
-    words = iter(argv)
-    for word in words:
-        name, equals, value = word.partition("=")
-        if name == "--recipe":
-            value = value if equals else next(words, "")
-            if not value:
-                raise BadInput("--recipe needs a file: --recipe FILE.toml")
-            recipe = Path(value)
-        elif word == "--json":
-            as_json = True
-        else:
-            rest.append(word)
-    return rest, recipe, as_json
+    name: str
+    """``--flag``, or the placeholder of a positional argument."""
+    kind: Any
+    """The field's type."""
+    is_required: bool
+
+    @property
+    def rule(self) -> Any:
+        """Tyro's rule for that type: how many words, and what they stand for."""
+        return ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(self.kind, set()))
+
+    @property
+    def is_flag(self) -> bool:
+        """Whether it is given by name, not by position."""
+        return self.name.startswith("--")
 
 
-def _parse_flags(config_class: type[C], flags: Sequence[str], verb: str, values: Mapping[str, Any]) -> C:
-    """Let tyro turn flags into a config whose defaults are `values`, and its complaints into one `BadInput`."""
-    import tyro
-
-    # Defaults in the shape that tyro wants them: an instance. It is not valid yet, so __post_init__ must not run.
-    draft = object.__new__(config_class)
+def _arguments(config_class: type[Any]) -> dict[str, _Argument]:
+    """Return a verb's arguments, by field."""
+    hints = get_type_hints(config_class, include_extras=True)
+    arguments = {}
     for field in dataclasses.fields(config_class):
-        default = values.get(field.name, _default(field))
-        object.__setattr__(draft, field.name, tyro.MISSING if default is dataclasses.MISSING else default)
+        hint = hints[field.name]
+        kind, *extras = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+        placeholder = next((extra.metavar for extra in extras if hasattr(extra, "metavar")), field.name.upper())
+        name = placeholder if tyro.conf.Positional in extras else f"--{_hyphenated(field.name)}"
+        is_required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        arguments[field.name] = _Argument(name, kind, is_required)
+    return arguments
+
+
+def _print_help(config_class: type[Any], verb: str, values: Mapping[str, Any]) -> None:
+    """Print the help of a verb, with `values` as the defaults, and exit."""
+    hints = get_type_hints(config_class, include_extras=True)
+    defaults = [(name, hints[name], dataclasses.field(default=value)) for name, value in values.items()]
+    with_defaults = dataclasses.make_dataclass("Config", defaults, bases=(config_class,), frozen=True, kw_only=True)
     description = f"{config_class.__doc__}\n\n{COMMON_FLAGS}"
-    complaint = io.StringIO()
-    try:
-        with redirect_stderr(complaint):
-            return tyro.cli(config_class, args=flags, prog=f"zest {verb}", description=description, default=draft)
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-        refusal = _cause(stop)
-        if refusal is not None:
-            raise refusal from None
-        raise BadInput(_unbox(complaint.getvalue())) from None
+    tyro.cli(with_defaults, args=["--help"], prog=f"zest {verb}", description=description)
 
 
-def _cause(error: BaseException) -> BadInput | None:
-    """Return the `BadInput` of a config's ``__post_init__`` that led to tyro's exit, if one did."""
-    earlier: BaseException | None = error
-    while earlier is not None and not isinstance(earlier, BadInput):
-        earlier = earlier.__cause__ or earlier.__context__
-    return earlier
+class _WordSplitter(argparse.ArgumentParser):
+    """Sorts the words of a command line by the arguments that they belong to."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise instead of exiting."""
+        raise BadInput(message)
 
 
-def _unbox(text: str) -> str:
-    """Turn tyro's framed message into plain lines."""
-    lines = [line.strip("│|").strip() for line in text.splitlines() if not line.startswith(("╭", "╰", "+"))]
-    parts = " ".join(line if line.strip("─-") else "\n" for line in lines).split("\n")
-    return "\n  ".join(part.strip() for part in parts)
+def _split_words(config_class: type[Any], argv: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
+    """Return the words that a command line gives for each field and common flag, and what those are that fit none."""
+    splitter = _WordSplitter(add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
+    splitter.add_argument("--recipe", dest="--recipe", nargs="?", const="")
+    splitter.add_argument("--json", dest="--json", action="store_true")
+    splitter.add_argument("-h", "--help", dest="--help", action="store_true")
+    arguments = _arguments(config_class)
+    for field, argument in arguments.items():
+        n_words = argument.rule.nargs
+        if not argument.is_flag:
+            splitter.add_argument(field, nargs="*" if n_words == "*" else "?")
+        elif argument.kind is bool:
+            splitter.add_argument(argument.name, dest=field, action=argparse.BooleanOptionalAction)
+        else:
+            splitter.add_argument(argument.name, dest=field, nargs=n_words)
+    given, unknown = splitter.parse_known_intermixed_args([_with_hyphens(word) for word in argv])
+    flags = [argument.name for argument in arguments.values() if argument.is_flag]
+    return vars(given), [
+        f"unknown flag {word!r}; {nearest(word, flags)}" if word.startswith("--") else f"unexpected {word!r}"
+        for word in unknown
+    ]
 
 
-def _check(config_class: type[Any], recipe: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+def _read_words(config_class: type[Any], given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Return the values that the words of `_split_words` stand for, as the help says, and what is wrong with them."""
+    values: dict[str, Any] = {}
+    problems: list[str] = []
+    for field, words in given.items():
+        argument = _arguments(config_class)[field]
+        texts = words if isinstance(words, list) else [str(words)]
+        try:
+            values[field] = argument.rule.instance_from_str(texts)
+        except ValueError:
+            problems.append(f"{argument.name} must be {_describe(argument.kind)}, got {' '.join(texts)!r}")
+    return values, problems
+
+
+def _read_table(config_class: type[Any], recipe: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return the recipe's values, converted to the types of the config's fields, and all that is wrong with it."""
-    kinds = get_type_hints(config_class)
+    arguments = _arguments(config_class)
     values: dict[str, Any] = {}
     problems: list[str] = []
     for key, value in recipe.items():
-        name = key.replace("-", "_")
-        if name not in kinds:
-            problems.append(f"unknown key {key!r}; {nearest(_flag(name), map(_flag, kinds))}")
-        elif name in values:
+        field = key.replace("-", "_")
+        if field not in arguments:
+            problems.append(f"unknown key {key!r}; {nearest(_hyphenated(key), map(_hyphenated, arguments))}")
+        elif field in values:
             problems.append(f"{key!r} is given twice, with '-' and with '_'")
         else:
             try:
-                values[name] = _convert(value, kinds[name])
+                values[field] = _convert(value, arguments[field].kind)
             except TypeError:
-                problems.append(f"{key!r} must be {_describe(kinds[name])}, got {value!r}")
+                problems.append(f"{key!r} must be {_describe(arguments[field].kind)}, got {value!r}")
     return values, problems
 
 
@@ -194,8 +243,6 @@ def _convert(value: object, kind: Any) -> Any:
     origin, args = get_origin(kind), get_args(kind)
     if kind is Any:
         return value
-    if origin is Annotated:
-        return _convert(value, args[0])
     if origin is dict and isinstance(value, dict):
         return {key: _convert(item, args[1]) for key, item in value.items()}
     if origin in (Union, types.UnionType):
@@ -222,8 +269,6 @@ def _convert(value: object, kind: Any) -> Any:
 
 def _describe(kind: Any) -> str:
     origin, args = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return _describe(args[0])
     if origin in (Union, types.UnionType):
         return " or ".join(_describe(option) for option in args if option is not type(None))
     if origin is dict:
@@ -237,11 +282,11 @@ def _describe(kind: Any) -> str:
     return {str: "a string", Path: "a path (string)", int: "an integer", float: "a number", bool: "true or false"}[kind]
 
 
-def _flag(name: str) -> str:
+def _hyphenated(name: str) -> str:
     return name.replace("_", "-")
 
 
-def _default(field: dataclasses.Field[Any]) -> Any:
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return field.default
+def _with_hyphens(word: str) -> str:
+    """Spell ``--n_episodes`` as ``--n-episodes``."""
+    flag, equals, value = word.partition("=")
+    return _hyphenated(flag) + equals + value if word.startswith("--") else word

@@ -18,7 +18,7 @@ class Config:
     said without it. With datasets of several tasks, also which task each goal scores highest.
     """
 
-    datasets: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="DATASET [DATASET …]")]
+    datasets: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="DATASET [DATASET …]")] = ()
     """Relabeled Minari datasets."""
     output: Path = Path("inspection.html")
     """The HTML page."""

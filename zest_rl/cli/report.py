@@ -15,7 +15,7 @@ from zest_rl.cli.ui import Ui
 class Config:
     """Compare evaluated runs of one task in one self-contained HTML file."""
 
-    runs: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN [RUN …]")]
+    runs: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN [RUN …]")] = ()
     """Folders of evaluated runs; runs that differ in their seed alone become one row."""
     output: Path = Path("report.html")
     """The HTML file."""

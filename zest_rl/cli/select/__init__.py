@@ -23,7 +23,7 @@ class Arguments:
     """What both selections need."""
 
     what: ClassVar[str]
-    datasets: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="DATASET [DATASET …]")]
+    datasets: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="DATASET [DATASET …]")] = ()
     """Kitchen datasets whose frames are the candidates: one (narrow) or several tasks (diverse)."""
     task: str | None = None
     """What the goal is of; default the task of the first dataset."""
