@@ -23,7 +23,7 @@ from zest_rl.evaluation.evaluate import EvaluationConfig, evaluate, target_retur
 from zest_rl.kitchen.collect import Behaviour, env_spec, rollout
 from zest_rl.kitchen.env import HORIZON
 from zest_rl.runtime.parallel import n_cores, one_thread
-from zest_rl.training.loop import train
+from zest_rl.training.loop import TrainingConfig, fit
 from zest_rl.types import Episode
 
 REQUIRED_SHARE = 0.7
@@ -60,8 +60,8 @@ def make_run(agent: str, folder: Path) -> Path:
     obs, actions, gt_reward = (recorded[name][0] for name in ("obs", "actions", "gt_reward"))
     dataset = {"env_spec": env_spec("micro").to_json(), "ref_min_score": 0.0, "ref_max_score": 70.0, "zest": {}}
     episode = Episode(obs, actions, np.asarray(gt_reward[1:], dtype=np.float32), terminated=False)
-    config = AGENTS[agent].config()
-    return train(agent, config, [episode], folder / agent, n_updates=1, seed=0, meta={"dataset": dataset}, device="cpu")
+    config = TrainingConfig(n_updates=1, device="cpu")
+    return fit(agent, AGENTS[agent].config(), [episode], folder / agent, config, meta={"dataset": dataset})
 
 
 def run() -> dict[str, object]:

@@ -83,15 +83,16 @@ def trained_root(collected_root: Path, tmp_path_factory: pytest.TempPathFactory)
     ``runs/``: bc-0 and bc-1 (two seeds) and dt-0 on the scores, gt-0 a Decision Transformer on the ground truth; all
     are evaluated for `SHORT_HORIZON` steps.
     """
-    from zest_rl.cli import train
-    from zest_rl.cli.ui import SilentUi
+    from zest_rl.agents import AGENTS
     from zest_rl.rewards.relabel import relabel
     from zest_rl.rewards.scorer import ScorerConfig
     from zest_rl.simulation.views import Views
+    from zest_rl.training.loop import TrainingConfig
+    from zest_rl.training.runs import train
 
     root = tmp_path_factory.mktemp("trained")
     shutil.copytree(collected_root, root / "minari")
-    small = {"n_updates": 30, "log_every": 10, "hidden_size": 32, "n_layers": 1, "warmup_updates": 0, "threads": 1}
+    small = {"hidden_size": 32, "n_layers": 1, "warmup_updates": 0}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MINARI_DATASETS_PATH", str(root / "minari"))
         patch.setenv("ZEST_CACHE", str(root / "cache"))
@@ -99,10 +100,8 @@ def trained_root(collected_root: Path, tmp_path_factory: pytest.TempPathFactory)
         scored = relabel(COLLECTED, ScorerConfig(views, "same-scene"), n_workers=1).dataset_id
         for name, dataset in (("bc-0", scored), ("bc-1", scored), ("dt-0", scored), ("gt-0", COLLECTED)):
             agent, seed = "bc" if name.startswith("bc") else "dt", int(name[-1])
-            config = train.CONFIGS[agent](
-                dataset=dataset, run_dir=root / "runs" / name, seed=seed, device="cpu", **small
-            )
-            train.run(config, SilentUi())
+            config = TrainingConfig(n_updates=30, seed=seed, device="cpu", threads=1, log_every=10)
+            train(agent, dataset, AGENTS[agent].config(**small), config, run_dir=root / "runs" / name)
     for path in root.glob("runs/*/meta.json"):
         meta = json.loads(path.read_text())
         spec = json.loads(meta["dataset"]["env_spec"]) | {"max_episode_steps": SHORT_HORIZON}

@@ -11,7 +11,7 @@ import torch
 from zest_rl.agents import bc, dt, load_policy
 from zest_rl.agents.base import describe_data
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.training.loop import train
+from zest_rl.training.loop import TrainingConfig, fit
 from zest_rl.types import Episode
 
 SMALL = bc.BCConfig(hidden_size=32, n_layers=2, batch_size=64, learning_rate=3e-3, warmup_updates=10, dropout=0.0)
@@ -28,7 +28,7 @@ def linear_episodes(n: int = 6, gain: float = 0.5) -> list[Episode]:
 
 
 def test_it_learns_the_action_of_the_data(tmp_path: Path) -> None:
-    run = train("bc", SMALL, linear_episodes(), tmp_path / "run", n_updates=400, seed=0, meta={}, threads=1)
+    run = fit("bc", SMALL, linear_episodes(), tmp_path / "run", TrainingConfig(n_updates=400, threads=1))
     policy = load_policy(run)
     policy.begin(20)
     obs = np.random.default_rng(1).uniform(-0.9, 0.9, (20, 2)).astype(np.float32)
@@ -87,7 +87,7 @@ def test_all_problems_of_a_config_are_named_at_once() -> None:
 
 
 def test_a_policy_refuses_observations_that_do_not_fit(tmp_path: Path) -> None:
-    policy = load_policy(train("bc", SMALL, linear_episodes(), tmp_path / "run", n_updates=1, seed=0, meta={}))
+    policy = load_policy(fit("bc", SMALL, linear_episodes(), tmp_path / "run", TrainingConfig(n_updates=1)))
     with pytest.raises(BadInput, match="call begin"):
         policy.act(np.zeros((3, 2), np.float32))
     policy.begin(3)
@@ -98,7 +98,7 @@ def test_a_policy_refuses_observations_that_do_not_fit(tmp_path: Path) -> None:
 
 
 def test_weights_with_a_flipped_bit_are_not_loaded(tmp_path: Path) -> None:
-    run = train("bc", SMALL, linear_episodes(), tmp_path / "run", n_updates=1, seed=0, meta={})
+    run = fit("bc", SMALL, linear_episodes(), tmp_path / "run", TrainingConfig(n_updates=1))
     path = run / "model.safetensors"
     data = bytearray(path.read_bytes())
     data[-1] ^= 1

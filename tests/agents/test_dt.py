@@ -14,7 +14,7 @@ from transformers import DecisionTransformerConfig, DecisionTransformerModel
 from zest_rl.agents import dt, load_policy
 from zest_rl.agents.base import Policy, describe_data, returns_to_go
 from zest_rl.errors import BadInput
-from zest_rl.training.loop import train
+from zest_rl.training.loop import TrainingConfig, fit
 from zest_rl.types import Episode, FloatArray
 
 SMALL = dt.DTConfig(
@@ -48,7 +48,7 @@ def play(policy: Policy, target: float | None, n: int = 5, steps: int = 8, rewar
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("dt") / "run"
-    return train("dt", SMALL, two_behaviours(), folder, n_updates=200, seed=0, meta={}, threads=1)
+    return fit("dt", SMALL, two_behaviours(), folder, TrainingConfig(n_updates=200, threads=1))
 
 
 def test_asked_for_a_high_or_a_low_return_it_chooses_the_behaviour_that_earned_it(run: Path) -> None:
@@ -61,7 +61,7 @@ def test_asked_for_a_high_or_a_low_return_it_chooses_the_behaviour_that_earned_i
 
 def test_without_conditioning_the_target_return_changes_nothing(tmp_path: Path) -> None:
     config = dt.DTConfig(condition_on_return=False, context_len=4, hidden_size=32, n_layers=1, batch_size=32)
-    policy = load_policy(train("dt", config, two_behaviours(), tmp_path / "run", n_updates=5, seed=0, meta={}))
+    policy = load_policy(fit("dt", config, two_behaviours(), tmp_path / "run", TrainingConfig(n_updates=5)))
     assert not policy.uses_return
     np.testing.assert_array_equal(play(policy, 8.0, reward=1.0), play(policy, None))
 
@@ -83,7 +83,7 @@ def test_the_actions_of_one_episode_do_not_depend_on_the_others(run: Path) -> No
 def test_acting_sees_what_training_sees(tmp_path: Path, timesteps: dt.Timesteps) -> None:
     """Step by step acting predicts what one pass over the same window predicts, at each of 7 steps with K = 4."""
     config = replace(SMALL, timesteps=timesteps)
-    folder = train("dt", config, two_behaviours(), tmp_path / "run", n_updates=20, seed=0, meta={}, threads=1)
+    folder = fit("dt", config, two_behaviours(), tmp_path / "run", TrainingConfig(n_updates=20, threads=1))
     policy = load_policy(folder)
     actions = play(policy, 8.0, n=2, steps=7, reward=1.0)
     facts = describe_data(two_behaviours())
@@ -115,7 +115,7 @@ def test_relative_timesteps_count_from_the_window_and_know_no_longest_episode(tm
     for valid, timesteps in zip(batch["valid"], batch["timesteps"], strict=True):
         assert timesteps[valid].tolist() == list(range(int(valid.sum())))
         assert not timesteps[~valid].any()
-    policy = load_policy(train("dt", config, episodes, tmp_path / "run", n_updates=1, seed=0, meta={}, threads=1))
+    policy = load_policy(fit("dt", config, episodes, tmp_path / "run", TrainingConfig(n_updates=1, threads=1)))
     assert np.isfinite(play(policy, 1.0, steps=30)).all()
 
 

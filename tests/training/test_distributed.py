@@ -102,7 +102,7 @@ def test_alone_nothing_is_shared_or_averaged() -> None:
 
 DISAGREE = """
 import torch
-from zest_rl.distributed import joined
+from zest_rl.training.distributed import joined
 with joined(torch.device("cpu")) as group:
     group.agree(finished=False)
     group.agree(updates_done=40 * group.rank)

@@ -25,7 +25,7 @@ from zest_rl.agents.dt import DTConfig
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.training import loop
 from zest_rl.training.checkpoints import TrainState, save_checkpoint, snapshot_folder
-from zest_rl.training.loop import train
+from zest_rl.training.loop import TrainingConfig, fit
 from zest_rl.types import Episode
 
 CONFIGS: dict[str, Any] = {
@@ -47,19 +47,21 @@ def make_episodes(n: int = 4, obs_dim: int = 3) -> list[Episode]:
 
 
 def start(run_dir: Path, agent: str = "dt", **changes: Any) -> Path:
-    arguments: dict[str, Any] = {
-        "n_updates": 30, "seed": 3, "meta": {"dataset": {"id": "toy-v0"}}, "threads": 1, "checkpoint_every": 7,
-        "log_every": 5, "device": "cpu",
-    }  # fmt: skip
-    return train(agent, CONFIGS[agent], make_episodes(), run_dir, **(arguments | changes))
+    arguments: dict[str, Any] = {"meta": {"dataset": {"id": "toy-v0"}}}
+    arguments |= {name: changes.pop(name) for name in ("meta", "files", "on_progress") if name in changes}
+    config = TrainingConfig(n_updates=30, seed=3, device="cpu", threads=1, checkpoint_every=7, log_every=5)
+    return fit(agent, CONFIGS[agent], make_episodes(), run_dir, replace(config, **changes), **arguments)
 
 
 def start_and_die(run_dir: Path, agent: str, n_done: int) -> None:
     """Train in another process, which kills itself with SIGKILL after `n_done` updates have been logged."""
     code = (
-        "import os, signal, sys; sys.path.insert(0, sys.argv[1]); from pathlib import Path; import test_training as t\n"
-        "def die(update, values):\n"
-        f"    if update == {n_done}: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "import os, signal, sys; sys.path.insert(0, sys.argv[1]); from pathlib import Path; import test_loop as t\n"
+        "done = 0\n"
+        "def die(n, **row):\n"
+        "    global done\n"
+        "    done += n\n"
+        f"    if done == {n_done}: os.kill(os.getpid(), signal.SIGKILL)\n"
         "t.start(Path(sys.argv[2]), sys.argv[3], on_progress=die)"
     )
     done = subprocess.run([sys.executable, "-c", code, str(Path(__file__).parent), str(run_dir), agent], check=False)
@@ -103,9 +105,9 @@ def test_a_run_killed_between_checkpoints_goes_on_from_the_last_and_ends_with_th
         "update-000000021",
     ]
     assert int(rows(run)[-1]["update"]) == 25
-    logged: list[int] = []
-    start(run, whole.name, on_progress=lambda update, values: logged.append(update))
-    assert logged == [25, 30]
+    reported: list[int] = []
+    start(run, whole.name, on_progress=lambda n, **row: reported.append(n))
+    assert reported == [25, 5], "what was done before the cut counts, too"
     assert (run / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
     assert rows(run) == rows(whole)
     assert not (run / "checkpoints").exists()
@@ -122,9 +124,10 @@ def test_the_policy_acts_with_the_moving_average_of_the_weights(tmp_path: Path) 
     """Snapshots without averaging are the trained weights after each update; their average is done by hand."""
     config, n = CONFIGS["bc"], 12
     plain = tmp_path / "plain"
-    train("bc", replace(config, ema_decay=0.0), make_episodes(), plain, n_updates=n, seed=3, meta={}, snapshot_every=1)
+    length = TrainingConfig(n_updates=n, seed=3)
+    fit("bc", replace(config, ema_decay=0.0), make_episodes(), plain, replace(length, snapshot_every=1))
     averaged = tmp_path / "averaged"
-    train("bc", replace(config, ema_decay=0.5), make_episodes(), averaged, n_updates=n, seed=3, meta={})
+    fit("bc", replace(config, ema_decay=0.5), make_episodes(), averaged, length)
     weights = [load_file(folder / "model.safetensors") for folder in (*sorted((plain / "snapshots").iterdir()), plain)]
     assert len(weights) == n
     torch.manual_seed(3)
@@ -204,7 +207,7 @@ def test_meta_tells_everything_that_is_needed_to_load_and_to_trace_the_weights(w
 
 def test_a_finished_run_is_not_trained_again(whole: Path) -> None:
     before = (whole / "meta.json").stat().st_mtime_ns
-    start(whole, whole.name, on_progress=lambda update, values: pytest.fail("it trains"))
+    start(whole, whole.name, on_progress=lambda n, **row: pytest.fail("it trains"))
     assert (whole / "meta.json").stat().st_mtime_ns == before
 
 
@@ -244,9 +247,9 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_it_serves_once_it_is_d
 def test_wrong_arguments_are_named_before_anything_is_written(tmp_path: Path) -> None:
     run = tmp_path / "run"
     with pytest.raises(BadInput, match="did you mean 'dt'"):
-        train("td", CONFIGS["dt"], make_episodes(), run, n_updates=1, seed=0, meta={})
+        fit("td", CONFIGS["dt"], make_episodes(), run, TrainingConfig())
     with pytest.raises(BadInput, match="agent 'dt' takes a DTConfig, got a BCConfig"):
-        train("dt", CONFIGS["bc"], make_episodes(), run, n_updates=1, seed=0, meta={})
+        fit("dt", CONFIGS["bc"], make_episodes(), run, TrainingConfig())
     with pytest.raises(BadInput, match=r"seed must be 0 or positive, got -1; n_updates must be at least 1, got 0"):
         start(run, n_updates=0, seed=-1)
     with pytest.raises(BadInput, match="device must be"):
@@ -258,7 +261,7 @@ def test_wrong_arguments_are_named_before_anything_is_written(tmp_path: Path) ->
 
 def test_data_that_do_not_suit_are_refused(tmp_path: Path) -> None:
     def attempt(episodes: list[Episode]) -> None:
-        train("bc", CONFIGS["bc"], episodes, tmp_path / "run", n_updates=1, seed=0, meta={})
+        fit("bc", CONFIGS["bc"], episodes, tmp_path / "run", TrainingConfig(n_updates=1))
 
     with pytest.raises(BadInput, match="at least 1 episode, got 0"):
         attempt([])
@@ -280,4 +283,4 @@ def test_a_joint_that_never_moved_in_the_data_does_not_blow_up_when_it_does() ->
 def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:
     config = BCConfig(hidden_size=4, n_layers=1, batch_size=4, learning_rate=1e38, warmup_updates=0, amp="fp32")
     with pytest.raises(ZestError, match="must be finite"):
-        train("bc", config, make_episodes(), tmp_path / "run", n_updates=50, seed=0, meta={}, threads=1)
+        fit("bc", config, make_episodes(), tmp_path / "run", TrainingConfig(n_updates=50, threads=1))

@@ -18,28 +18,25 @@ Under ``torchrun`` the processes share the work (`zest_rl.training.distributed`)
 
 from __future__ import annotations
 
-import csv
 import json
 import math
-import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Protocol
 
 import numpy as np
 import safetensors.torch
 import torch
-from torch import Tensor, nn
-from torch.utils.tensorboard import SummaryWriter
+from torch import nn
 
 from zest_rl.agents import get_agent
 from zest_rl.agents.base import (
-    DataFacts,
-    Rules,
+    OptimizerConfig,
     autocast,
     check_fields,
     describe_data,
@@ -49,45 +46,73 @@ from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint, snapshot_folder
 from zest_rl.training.distributed import Group, joined, launched, local_index
+from zest_rl.training.log import COLUMNS, MetricsLog
 from zest_rl.types import Episode
 
-Progress = Callable[[int, dict[str, float]], None]
-COLUMNS = ("loss", "grad_norm", "learning_rate", "updates_per_s")
 RESULT_KEYS = ("n_params", "model_sha256", "train_seconds", "made_by")  # keys of meta.json that only the end knows
 
 
-def train(
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How long and where a policy is trained, whatever the algorithm; the algorithm has a config of its own."""
+
+    n_updates: int = 5000
+    """Gradient steps."""
+    seed: int = 0
+    """Of weights, batches and dropout."""
+    device: str = "auto"
+    """auto (CUDA where there is a GPU), cpu, cuda, cuda:1, …"""
+    threads: int | None = None
+    """CPU threads; default torch's own. The last digits of the result depend on it."""
+    checkpoint_every: int = 500
+    """Updates between checkpoints, from which a cut run goes on."""
+    log_every: int = 50
+    """Updates between log rows (metrics.csv, TensorBoard), each of which holds means over these updates."""
+    snapshot_every: int | None = None
+    """Updates between policies kept in RUN/snapshots, which `zest evaluate` takes too; default none."""
+
+    def __post_init__(self) -> None:
+        check_fields("training", self, {
+            "seed": (self.seed >= 0, "0 or positive"),
+            "n_updates": (self.n_updates >= 1, "at least 1"),
+            "threads": (self.threads is None or self.threads >= 1, "at least 1, or None"),
+            "checkpoint_every": (self.checkpoint_every >= 1, "at least 1"),
+            "log_every": (self.log_every >= 1, "at least 1"),
+            "snapshot_every": (self.snapshot_every is None or self.snapshot_every >= 1, "at least 1, or None"),
+        })  # fmt: skip
+
+
+class OnProgress(Protocol):
+    """Called after every logged row."""
+
+    def __call__(self, n: int, **fields: float) -> None:
+        """Take the number of updates since the last call (at first, since update 0), and the row by `COLUMNS`."""
+
+
+def fit(
     agent: str,
-    config: Any,
+    agent_config: Any,
     episodes: Sequence[Episode],
     run_dir: Path,
+    config: TrainingConfig,
     *,
-    n_updates: int,
-    seed: int,
-    meta: Mapping[str, Any],
-    device: str = "auto",
-    threads: int | None = None,
-    checkpoint_every: int = 500,
-    log_every: int = 50,
-    snapshot_every: int | None = None,
-    on_progress: Progress | None = None,
+    meta: Mapping[str, Any] = MappingProxyType({}),
+    files: Mapping[str, bytes] = MappingProxyType({}),
+    on_progress: OnProgress | None = None,
 ) -> Path:
     """Train a policy, or go on with a run that was cut short; return `run_dir`. A finished run returns at once.
 
+    `zest_rl.training.runs.train` calls this with a dataset's episodes and facts.
+
     Args:
         agent: name in `zest_rl.agents.AGENTS`.
-        config: that agent's config.
+        agent_config: that agent's config.
         episodes: the data; the rewards in them are all that is known about quality.
         run_dir: folder of this run alone.
-        n_updates: gradient steps.
-        seed: of the weights, the batches and the dropout.
+        config: how long and where.
         meta: facts about the data (JSON), copied into ``meta.json`` beside the run's own; part of the run's identity.
-        device: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``: CUDA where there is one.
-        threads: CPU threads; torch's current number by default. Bits depend on it, so it is recorded.
-        checkpoint_every: updates between checkpoints.
-        log_every: updates between rows of the log; a row holds means over the updates since the last one.
-        snapshot_every: updates between policies kept under ``snapshots/``, for learning curves; none by default.
-        on_progress: called after every logged row with the number of updates done and the row.
+        files: name → content of what else the run and its snapshots hold.
+        on_progress: see `OnProgress`.
 
     Raises:
         BadInput: an argument is out of range, the data do not suit, or `run_dir` holds another run.
@@ -95,23 +120,21 @@ def train(
             of this training is gone.
     """
     definition = get_agent(agent)
-    if not isinstance(config, definition.config):
-        raise BadInput(f"agent {agent!r} takes a {definition.config.__name__}, got a {type(config).__name__}")
-    n_threads = torch.get_num_threads() if threads is None else threads
-    arguments = _Arguments(n_updates, seed, n_threads, checkpoint_every, log_every, snapshot_every)
-    place = _find_device(device)
+    if not isinstance(agent_config, definition.config):
+        raise BadInput(f"agent {agent!r} takes a {definition.config.__name__}, got a {type(agent_config).__name__}")
+    device = _find_device(config.device)
     facts = describe_data(episodes)
-    sample = definition.sampler(config, facts, episodes)
-    launched().share(sample(np.random.default_rng(seed)))  # a batch that is too small is refused before all else
-    precision = resolve_precision(config.amp, place)
+    sample = definition.sampler(agent_config, facts, episodes)
+    launched().share(sample(np.random.default_rng(config.seed)))  # a batch that is too small is refused before all else
+    precision = resolve_precision(agent_config.amp, device)
     request: dict[str, Any] = {
         "agent": agent,
-        "config": asdict(config),
-        "n_updates": n_updates,
-        "seed": seed,
-        "device": str(place),
-        "threads": arguments.threads,
-        "snapshot_every": snapshot_every,
+        "config": asdict(agent_config),
+        "n_updates": config.n_updates,
+        "seed": config.seed,
+        "device": str(device),
+        "threads": torch.get_num_threads() if config.threads is None else config.threads,
+        "snapshot_every": config.snapshot_every,
         "precision": precision,
         "data_sha256": artifacts.hash_arrays(*(a for e in episodes for a in (e.obs, e.actions, e.rewards))),
     }
@@ -121,124 +144,93 @@ def train(
     if taken:
         raise BadInput(f"meta must not use the keys {', '.join(taken)}, which meta.json has already; rename them")
     request |= meta
+    described = request | asdict(facts)
 
-    with joined(place) as group, artifacts.lock(run_dir) if group.leads else nullcontext():
+    with (
+        joined(device) as group,
+        _claimed(run_dir, request, group) as finished,
+        _torch_set_up(config.seed, request["threads"], device),
+    ):
+        if finished:
+            return run_dir
+        model = definition.build(agent_config, facts).to(device)
+        state = TrainState.start(model, agent_config.weight_decay, config.seed)
+        resume(run_dir, state)
+        group.agree(updates_done=state.update)
+        _reseed_others(config.seed, group, state.update)
+        params = list(state.params.values())
+        n_reported, row_update = 0, state.update
+        tick = row_tick = time.perf_counter()
+        with MetricsLog(run_dir, state.update) if group.leads else nullcontext() as log:
+            while state.update < config.n_updates:
+                # sample
+                rows, weight = group.share(sample(state.rng))
+                batch = {name: tensor.to(device) for name, tensor in rows.items()}
+                # loss
+                with autocast(precision, device):
+                    loss = definition.loss(state.model, batch) * weight
+                # step
+                learning_rate = _learning_rate(agent_config, state.update)
+                for options in state.optimizer.param_groups:
+                    options["lr"] = learning_rate
+                state.optimizer.zero_grad()
+                loss.backward()  # type: ignore[no-untyped-call]
+                loss = loss.detach()
+                group.average([loss, *(p.grad for p in params if p.grad is not None)])
+                norm = nn.utils.clip_grad_norm_(params, agent_config.grad_clip)
+                state.optimizer.step()
+                state.update += 1
+                state.follow(params, agent_config.ema_decay)
+                state.recent.append((loss.item(), norm.item()))
+                if not all(map(math.isfinite, state.recent[-1])):
+                    raise ZestError(
+                        f"loss and gradient must be finite, got {state.recent[-1]} at update {state.update}; "
+                        "lower learning_rate or set amp to fp32, and train into a new folder"
+                    )
+                now = time.perf_counter()
+                state.seconds, tick = state.seconds + now - tick, now
+                # log
+                ends = state.update == config.n_updates
+                if state.update % config.log_every == 0 or ends:
+                    losses, norms = np.mean(state.recent, axis=0)
+                    speed = (state.update - row_update) / (now - row_tick)
+                    values = (float(losses), float(norms), learning_rate, round(speed, 2))
+                    row = dict(zip(COLUMNS, values, strict=True))
+                    state.recent, row_update, row_tick = [], state.update, now
+                    if log is not None:
+                        log.write(state.update, row)
+                    if on_progress is not None:
+                        on_progress(state.update - n_reported, **row)
+                    n_reported = state.update
+                # save
+                at_checkpoint = state.update % config.checkpoint_every == 0
+                if at_checkpoint:
+                    _reseed_others(config.seed, group, state.update)
+                if group.leads and not ends:
+                    # before the checkpoint: a run that goes on from there does not come by here again
+                    if config.snapshot_every is not None and state.update % config.snapshot_every == 0:
+                        _write_snapshot(run_dir, state, described, files)
+                    if at_checkpoint:
+                        save_checkpoint(run_dir, state)
         if group.leads:
-            _claim(run_dir, request)
-        group.agree(data_sha256=request["data_sha256"], precision=precision)  # and wait for the claim
-        finished = (run_dir / "meta.json").exists()
-        group.agree(finished=finished)
-        if not finished:
-            with _torch_set_up(seed, arguments.threads, place):
-                state = TrainState.start(definition.build(config, facts).to(place), config.weight_decay, seed)
-                resume(run_dir, state)
-                group.agree(updates_done=state.update)
-
-                def draw_loss() -> Tensor:
-                    rows, weight = group.share(sample(state.rng))
-                    batch = {name: tensor.to(place) for name, tensor in rows.items()}
-                    with autocast(precision, place):
-                        return definition.loss(state.model, batch) * weight
-
-                def keep_snapshot() -> None:
-                    folder = snapshot_folder(run_dir, state.update)
-                    if not folder.exists():
-                        with artifacts.staged_folder(folder) as staging:
-                            _write_policy(staging, state, request | {"n_updates": state.update}, facts)
-
-                _fit(run_dir, state, draw_loss, config, arguments, keep_snapshot, on_progress, group)
-            if group.leads:
-                _write_policy(run_dir, state, request, facts)
-        if group.leads:
-            shutil.rmtree(run_dir / "checkpoints", ignore_errors=True)
-        group.agree()  # files are there when any of them returns
+            _write_policy(run_dir, state, described, files)
     return run_dir
 
 
-@dataclass(frozen=True)
-class _Arguments:
-    n_updates: int
-    seed: int
-    threads: int
-    checkpoint_every: int
-    log_every: int
-    snapshot_every: int | None
-
-    def __post_init__(self) -> None:
-        rules: Rules = {
-            "seed": (self.seed >= 0, "0 or positive"),
-            **{
-                name: (getattr(self, name) >= 1, "at least 1")
-                for name in ("n_updates", "threads", "checkpoint_every", "log_every")
-            },
-            "snapshot_every": (self.snapshot_every is None or self.snapshot_every >= 1, "at least 1, or None"),
-        }
-        check_fields("training", self, rules)
+def _learning_rate(config: OptimizerConfig, n_done: int) -> float:
+    """Return the step size of the update after `n_done` updates: a linear warm-up, then constant."""
+    warm = min(1.0, (n_done + 1) / config.warmup_updates) if config.warmup_updates else 1.0
+    return config.learning_rate * warm
 
 
-# ------------------------------------------------------------------------------------------------------------ loop
+# ----------------------------------------------------------------------------------------------------- set-up of torch
 
 
-def _fit(
-    run_dir: Path,
-    state: TrainState,
-    draw_loss: Callable[[], Tensor],
-    config: Any,
-    arguments: _Arguments,
-    keep_snapshot: Callable[[], None],
-    on_progress: Progress | None,
-    group: Group,
-) -> None:
-    params = list(state.params.values())
-    log = _open_log(run_dir, state.update) if group.leads else nullcontext(lambda _update, _row: None)
-    with log as write_row:
-        tick = row_tick = time.perf_counter()
-        row_update = state.update
-        _draw_apart(arguments.seed, group, state.update)
-        while state.update < arguments.n_updates:
-            warm = min(1.0, (state.update + 1) / config.warmup_updates) if config.warmup_updates else 1.0
-            for options in state.optimizer.param_groups:
-                options["lr"] = config.learning_rate * warm
-            loss = draw_loss()
-            state.optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            loss = loss.detach()
-            group.average([loss, *(p.grad for p in params if p.grad is not None)])
-            norm = nn.utils.clip_grad_norm_(params, config.grad_clip)
-            state.optimizer.step()
-            state.update += 1
-            state.follow(params, config.ema_decay)
-            state.recent.append((loss.item(), norm.item()))
-            if not all(map(math.isfinite, state.recent[-1])):
-                raise ZestError(
-                    f"loss and gradient must be finite, got {state.recent[-1]} at update {state.update}; "
-                    "lower learning_rate or set amp to fp32, and train into a new folder"
-                )
-            now = time.perf_counter()
-            state.seconds, tick = state.seconds + now - tick, now
-            if state.update % arguments.log_every == 0 or state.update == arguments.n_updates:
-                losses, norms = np.mean(state.recent, axis=0)
-                speed = (state.update - row_update) / (now - row_tick)
-                values = (float(losses), float(norms), config.learning_rate * warm, round(speed, 2))
-                row = dict(zip(COLUMNS, values, strict=True))
-                write_row(state.update, row)
-                state.recent, row_update, row_tick = [], state.update, now
-                if on_progress is not None:
-                    on_progress(state.update, row)
-            if state.update % arguments.checkpoint_every == 0:
-                _draw_apart(arguments.seed, group, state.update)
-            if not group.leads:
-                continue
-            every = arguments.snapshot_every
-            if every is not None and state.update % every == 0 and state.update < arguments.n_updates:
-                keep_snapshot()  # before the checkpoint: a run that goes on from there does not come by here again
-            if state.update % arguments.checkpoint_every == 0 and state.update < arguments.n_updates:
-                save_checkpoint(run_dir, state)
+def _reseed_others(seed: int, group: Group, update: int) -> None:
+    """Seed every process but the first anew, which is done at the start and at each checkpoint.
 
-
-def _draw_apart(seed: int, group: Group, update: int) -> None:
-    """Seed the processes that follow anew, at each checkpoint: they drop other units than the first, whose generator is
-    in the checkpoint, and the same ones whether the run was cut there or not.
+    So they drop other units than the first process, whose generator is in the checkpoint, and the same ones whether the
+    run was cut there or not.
     """
     if not group.leads:
         torch.manual_seed(int(np.random.SeedSequence([seed, group.rank, update]).generate_state(1)[0]))
@@ -276,39 +268,28 @@ def _find_device(name: str) -> torch.device:
     return torch.device("cuda", gpu)
 
 
-# ------------------------------------------------------------------------------------------------------------- log
+# -------------------------------------------------------------------------------------------------------- run folder
 
 
 @contextmanager
-def _open_log(run_dir: Path, n_done: int) -> Iterator[Callable[[int, Mapping[str, float]], None]]:
-    """Open ``metrics.csv`` and ``tb/`` after dropping what a killed run logged past update `n_done`."""
-    path, header = run_dir / "metrics.csv", ",".join(("update", *COLUMNS))
-    lines = path.read_text().splitlines() if path.exists() and n_done else []
-    kept = [line for line in lines[1:] if line.count(",") == len(COLUMNS) and int(line.partition(",")[0]) <= n_done]
-    artifacts.write_bytes(path, "".join(f"{line}\n" for line in (header, *kept)).encode())
-    if not n_done:
-        shutil.rmtree(run_dir / "tb", ignore_errors=True)
-    board = SummaryWriter(run_dir / "tb", purge_step=n_done + 1)
-    with path.open("a", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
+def _claimed(run_dir: Path, request: dict[str, Any], group: Group) -> Iterator[bool]:
+    """Hold a run folder for this training, on all of its processes; yield whether the run in it is finished.
 
-        def write_row(update: int, values: Mapping[str, float]) -> None:
-            writer.writerow([update, *values.values()])
-            file.flush()
-            os.fsync(file.fileno())  # a checkpoint after this row must find it
-            for name, value in values.items():
-                board.add_scalar(name, value, update)
-
-        try:
-            yield write_row
-        finally:
-            board.close()
+    On success the checkpoints are removed at the end, and no process leaves before all files are there.
+    """
+    with artifacts.lock(run_dir) if group.leads else nullcontext():
+        if group.leads:
+            _check_request(run_dir, request)
+        group.agree(data_sha256=request["data_sha256"], precision=request["precision"])  # and wait for the check
+        finished = (run_dir / "meta.json").exists()
+        group.agree(finished=finished)
+        yield finished
+        if group.leads:
+            shutil.rmtree(run_dir / "checkpoints", ignore_errors=True)
+        group.agree()
 
 
-# --------------------------------------------------------------------------------------------------- start and end
-
-
-def _claim(run_dir: Path, request: dict[str, Any]) -> None:
+def _check_request(run_dir: Path, request: dict[str, Any]) -> None:
     """Write ``run.json``, or check that the one that is there asks for the same."""
     path = run_dir / "run.json"
     if path.exists():
@@ -337,10 +318,19 @@ def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return items
 
 
-def _write_policy(folder: Path, state: TrainState, request: dict[str, Any], facts: DataFacts) -> None:
-    """Write the weights, then ``meta.json``."""
+def _write_snapshot(run_dir: Path, state: TrainState, described: dict[str, Any], files: Mapping[str, bytes]) -> None:
+    """Keep the policy of this moment as the one of a training that ends here."""
+    folder = snapshot_folder(run_dir, state.update)
+    if not folder.exists():
+        with artifacts.staged_folder(folder) as staging:
+            _write_policy(staging, state, described | {"n_updates": state.update}, files)
+
+
+def _write_policy(folder: Path, state: TrainState, described: dict[str, Any], files: Mapping[str, bytes]) -> None:
+    """Write the weights and `files`, then ``meta.json``."""
     weights = safetensors.torch.save(state.averaged_weights())
-    artifacts.write_bytes(folder / "model.safetensors", weights)
+    for name, content in {**files, "model.safetensors": weights}.items():
+        artifacts.write_bytes(folder / name, content)
     n_params = sum(p.numel() for p in state.params.values())
     results = (n_params, artifacts.hash_bytes(weights), round(state.seconds, 1), artifacts.provenance())
-    artifacts.write_json(folder / "meta.json", request | asdict(facts) | dict(zip(RESULT_KEYS, results, strict=True)))
+    artifacts.write_json(folder / "meta.json", described | dict(zip(RESULT_KEYS, results, strict=True)))

@@ -1,0 +1,50 @@
+"""The log of a training: ``metrics.csv`` for programs, ``tb/`` for TensorBoard; both hold the same rows."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from torch.utils.tensorboard import SummaryWriter
+
+from zest_rl.runtime import artifacts
+
+COLUMNS = ("loss", "grad_norm", "learning_rate", "updates_per_s")
+
+
+class MetricsLog:
+    """Appends rows to the log of a run; use it as a context manager."""
+
+    def __init__(self, run_dir: Path, n_done: int) -> None:
+        """Open the log, and drop what a killed run logged past update `n_done`."""
+        path, header = run_dir / "metrics.csv", ",".join(("update", *COLUMNS))
+        lines = path.read_text().splitlines() if path.exists() and n_done else []
+        kept = [line for line in lines[1:] if line.count(",") == len(COLUMNS) and int(line.partition(",")[0]) <= n_done]
+        artifacts.write_bytes(path, "".join(f"{line}\n" for line in (header, *kept)).encode())
+        if not n_done:
+            shutil.rmtree(run_dir / "tb", ignore_errors=True)
+        self._board = SummaryWriter(run_dir / "tb", purge_step=n_done + 1)
+        self._file = path.open("a", newline="")
+        self._rows = csv.writer(self._file, lineterminator="\n")
+
+    def write(self, update: int, row: Mapping[str, float]) -> None:
+        """Append the values of `COLUMNS` at an update; they are on disk when this returns."""
+        self._rows.writerow([update, *(row[column] for column in COLUMNS)])
+        self._file.flush()
+        os.fsync(self._file.fileno())  # a checkpoint after this row must find it
+        for column in COLUMNS:
+            self._board.add_scalar(column, row[column], update)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._file.close()
+        self._board.close()

@@ -1,0 +1,64 @@
+"""A dataset → a run folder that is complete without it: what the data are, and the scorer of their rewards."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from zest_rl.agents import get_agent
+from zest_rl.data import reader
+from zest_rl.rewards.relabel import SCORER_FILE
+from zest_rl.training.loop import OnProgress, TrainingConfig, fit
+
+
+def train(
+    agent: str,
+    dataset_id: str,
+    agent_config: Any = None,
+    config: TrainingConfig | None = None,
+    *,
+    run_dir: Path | None = None,
+    on_progress: OnProgress | None = None,
+) -> Path:
+    """Train a policy on a dataset, or go on with a run that was cut short; a finished run returns at once.
+
+    Args:
+        agent: name in `zest_rl.agents.AGENTS`.
+        dataset_id: Minari dataset; its rewards are all that is known about quality.
+        agent_config: that agent's config; default its defaults.
+        config: how long and where; default the defaults of `TrainingConfig`.
+        run_dir: folder of this run alone; default `default_run_dir`.
+        on_progress: see `OnProgress`.
+
+    Returns:
+        The run's folder, which `zest_rl.evaluation.evaluate.evaluate` takes. It holds the dataset's scorer, if the
+        dataset has one, so that the policy can be evaluated with online scores.
+
+    Raises:
+        BadInput: an argument is out of range, there is no such dataset or it does not suit, or the folder holds another
+            run.
+        ZestError: the loss is not finite, a file is damaged, the folder cannot be written to, or another process of
+            this training is gone.
+    """
+    config = TrainingConfig() if config is None else config
+    return fit(
+        agent,
+        get_agent(agent).config() if agent_config is None else agent_config,
+        reader.read_episodes(dataset_id),
+        run_dir or default_run_dir(agent, dataset_id, config.seed),
+        config,
+        meta={"dataset": reader.describe(dataset_id)},
+        files=scorer_files(dataset_id),
+        on_progress=on_progress,
+    )
+
+
+def default_run_dir(label: str, dataset_id: str, seed: int) -> Path:
+    """Return ``runs/DATASET-LABEL-seedN``, where the label is an agent or says which policy was adopted."""
+    return Path("runs") / f"{dataset_id.split('/')[-1]}-{label}-seed{seed}"
+
+
+def scorer_files(dataset_id: str) -> dict[str, bytes]:
+    """Return what a run on this dataset must hold to be scored online: name → content; nothing if it was not scored."""
+    path = reader.dataset_path(dataset_id) / SCORER_FILE
+    return {SCORER_FILE: path.read_bytes()} if path.exists() else {}
