@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from zest_rl.agents import get_agent
-from zest_rl.data import reader
+from zest_rl.data.reader import Dataset, open_dataset
 from zest_rl.rewards.relabel import SCORER_FILE
 from zest_rl.training.loop import OnProgress, TrainingConfig, fit
 
@@ -41,14 +41,16 @@ def train(
             this training is gone.
     """
     config = TrainingConfig() if config is None else config
+    with open_dataset(dataset_id) as dataset:
+        episodes, meta, files = dataset.episodes(), {"dataset": dataset.describe()}, scorer_files(dataset)
     return fit(
         agent,
         get_agent(agent).config() if agent_config is None else agent_config,
-        reader.read_episodes(dataset_id),
+        episodes,
         run_dir or default_run_dir(agent, dataset_id, config.seed),
         config,
-        meta={"dataset": reader.describe(dataset_id)},
-        files=scorer_files(dataset_id),
+        meta=meta,
+        files=files,
         on_progress=on_progress,
     )
 
@@ -58,7 +60,7 @@ def default_run_dir(label: str, dataset_id: str, seed: int) -> Path:
     return Path("runs") / f"{dataset_id.split('/')[-1]}-{label}-seed{seed}"
 
 
-def scorer_files(dataset_id: str) -> dict[str, bytes]:
-    """Return what a run on this dataset must hold to be scored online: name → content; nothing if it was not scored."""
-    path = reader.dataset_path(dataset_id) / SCORER_FILE
+def scorer_files(dataset: Dataset) -> dict[str, bytes]:
+    """Return what a run on a dataset must hold to be scored online: name → content; nothing if it was not scored."""
+    path = dataset.path / SCORER_FILE
     return {SCORER_FILE: path.read_bytes()} if path.exists() else {}
