@@ -30,7 +30,8 @@ from zest_rl.rewards.relabel import relabel
 from zest_rl.rewards.scorer import Scorer, ScorerConfig
 from zest_rl.rewards.state_embeddings import STATES_PER_SHARD
 from zest_rl.runtime import artifacts
-from zest_rl.runtime.parallel import chunks, concatenate, one_thread, write_arrays
+from zest_rl.runtime.arrays import concatenate, write_arrays
+from zest_rl.runtime.parallel import chunks, one_thread
 from zest_rl.simulation.rendering import select_gl_backend
 from zest_rl.simulation.views import Views, distinct_states
 

@@ -38,7 +38,7 @@ def collect_some(dataset_id: str, task: str, n_episodes: int) -> None:
     """Leave a few noisy episodes of the expert in the Minari root."""
     from zest_rl.data.writer import write_dataset
     from zest_rl.kitchen import collect
-    from zest_rl.runtime.parallel import concatenate
+    from zest_rl.runtime.arrays import concatenate
 
     behaviour = collect.Behaviour(task, "expert", noise_max=1.0)
     episodes = concatenate([collect.rollout(behaviour, index) for index in range(n_episodes)])

@@ -29,7 +29,7 @@ from zest_rl.kitchen.collect import (
 )
 from zest_rl.kitchen.env import HORIZON
 from zest_rl.kitchen.experts import DONE_PROGRESS, Manner, make_expert
-from zest_rl.runtime.parallel import Arrays, concatenate
+from zest_rl.runtime.arrays import Arrays, concatenate
 
 NOISY = Behaviour("micro", "expert", noise_max=0.6)
 DRAWN = {"level", "stop_at", "speed"}

@@ -16,7 +16,8 @@ from zest_rl.errors import ZestError
 from zest_rl.kitchen.env import KitchenEnv
 from zest_rl.rewards import state_embeddings
 from zest_rl.rewards.state_embeddings import STATES_PER_SHARD, EmbedConfig, StateEmbedder
-from zest_rl.runtime.parallel import chunks, one_thread, write_arrays
+from zest_rl.runtime.arrays import write_arrays
+from zest_rl.runtime.parallel import chunks, one_thread
 from zest_rl.simulation.views import Views, canonical_states
 
 VIEWS = Views("micro", n_views=2, size=96)

@@ -8,26 +8,13 @@ import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.runtime import artifacts
-from zest_rl.runtime.parallel import (
-    Arrays,
-    chunks,
-    concatenate,
-    map_jobs,
-    n_cores,
-    one_thread,
-    read_arrays,
-    write_arrays,
-)
-
-if TYPE_CHECKING:
-    from conftest import Disk
+from zest_rl.runtime.arrays import Arrays, read_arrays
+from zest_rl.runtime.parallel import cached_jobs, chunks, n_cores, one_thread, run_jobs
 
 # --- work that is sent to other processes -----------------------------------------------------------------------------
 
@@ -49,11 +36,11 @@ def refuse(seed: int) -> Arrays:
     raise BadInput(f"seed {seed} is refused")
 
 
-def be_killed_elsewhere(parent: int) -> Arrays:
-    """Return at once in the process `parent`; die in any other as the out-of-memory killer does it."""
-    if os.getpid() != parent:
+def be_killed_after_the_first(parent: int, folder: Path, seed: int) -> Arrays:
+    """Die as the out-of-memory killer does it when a part is there, but not in the process `parent`."""
+    if os.getpid() != parent and list(folder.glob("*.npz")):
         os.kill(os.getpid(), signal.SIGKILL)
-    return {"values": np.ones(3)}
+    return draw(seed)
 
 
 def wait_for_two(folder: Path) -> Arrays:
@@ -83,11 +70,7 @@ class Shared:
         return Shared, ()
 
 
-def draw_once_all_others_are_drawn(shared: Shared, parent: int, folder: Path, seed: int) -> Arrays:
-    """In the process `parent` wait until but one part is there; draw at once in any other."""
-    deadline = time.monotonic() + 60
-    while os.getpid() == parent and len(list(folder.glob("*.npz"))) < len(SEEDS) - 1 and time.monotonic() < deadline:
-        time.sleep(0.02)
+def draw_with(shared: Shared, seed: int) -> Arrays:
     return draw(seed)
 
 
@@ -110,78 +93,25 @@ def processes(folder: Path) -> set[int]:
 
 SEEDS: Mapping[str, int] = {f"part-{seed}": seed for seed in range(4)}
 
-# --- files ------------------------------------------------------------------------------------------------------------
-
-
-def test_arrays_survive_the_way_to_disk_and_back(tmp_path: Path) -> None:
-    arrays: dict[str, Any] = {"a": np.arange(6, dtype=np.uint8).reshape(2, 3), "b": np.array([True]), "c": np.zeros(0)}
-    write_arrays(tmp_path / "deep/part.npz", arrays)
-    got = read_arrays(tmp_path / "deep/part.npz")
-    assert got is not None
-    assert got.keys() == arrays.keys()
-    for name, array in arrays.items():
-        assert got[name].dtype == array.dtype
-        np.testing.assert_array_equal(got[name], array)
-
-
-def test_a_missing_file_reads_as_none(tmp_path: Path) -> None:
-    assert read_arrays(tmp_path / "part.npz") is None
-
-
-def test_no_damage_of_one_byte_makes_other_numbers_or_a_crash(tmp_path: Path) -> None:
-    path = tmp_path / "part.npz"
-    values = np.arange(4, dtype=np.float32)
-    write_arrays(path, {"values": values})
-    whole = path.read_bytes()
-    n_damaged = 0
-    for position in range(len(whole)):
-        path.write_bytes(whole[:position] + bytes([whole[position] ^ 0x01]) + whole[position + 1 :])
-        got = read_arrays(path)
-        n_damaged += got is None
-        assert not got or got["values"].tobytes() == values.tobytes()
-        path.write_bytes(whole[:position])
-        assert read_arrays(path) is None
-    assert n_damaged > len(whole) / 2
-
-
-def test_a_pickle_in_an_npz_file_is_never_opened(tmp_path: Path) -> None:
-    np.savez(tmp_path / "part.npz", values=np.array([{"a": 1}], dtype=object))
-    assert read_arrays(tmp_path / "part.npz") is None
-
-
-def test_a_full_disk_leaves_the_old_part_and_no_half_of_the_new_one(
-    disk: Disk, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = disk.path / "part.npz"
-    with pytest.raises(ZestError, match="not enough disk space"):
-        write_arrays(path, {"values": np.ones(3)})
-    monkeypatch.setattr(artifacts, "check_free_space", lambda folder, n_bytes: None)
-    write_arrays(path, {"values": np.ones(3)})
-    with pytest.raises(ZestError, match="No space left on device"):
-        write_arrays(path, {"values": np.ones(2_000_000)})
-    np.testing.assert_array_equal((read_arrays(path) or {})["values"], np.ones(3))
-    assert [p.name for p in disk.path.iterdir()] == ["part.npz"]
-
-
 # --- jobs in this process ---------------------------------------------------------------------------------------------
 
 
 def test_finished_parts_are_not_done_again_and_are_still_reported(tmp_path: Path) -> None:
     calls: list[int] = []
     done: list[str] = []
-    map_jobs(counted(calls), {"part-0": 0, "part-1": 1}, tmp_path, n_workers=1, on_done=done.append)
-    map_jobs(counted(calls), SEEDS, tmp_path, n_workers=1, on_done=done.append)
+    cached_jobs(counted(calls), {"part-0": 0, "part-1": 1}, tmp_path, n_workers=1, on_done=done.append)
+    cached_jobs(counted(calls), SEEDS, tmp_path, n_workers=1, on_done=done.append)
     assert calls == [0, 1, 2, 3]
     assert done == ["part-0", "part-1", *SEEDS]
 
 
 def test_a_damaged_part_is_done_again(tmp_path: Path) -> None:
     calls: list[int] = []
-    map_jobs(counted(calls), SEEDS, tmp_path, n_workers=1)
+    cached_jobs(counted(calls), SEEDS, tmp_path, n_workers=1)
     before = numbers(tmp_path)
     damaged = tmp_path / "part-2.npz"
     damaged.write_bytes(damaged.read_bytes()[:-100])
-    map_jobs(counted(calls), SEEDS, tmp_path, n_workers=1)
+    cached_jobs(counted(calls), SEEDS, tmp_path, n_workers=1)
     assert calls == [0, 1, 2, 3, 2]
     assert numbers(tmp_path) == before
 
@@ -191,7 +121,7 @@ def test_a_failing_job_keeps_the_parts_before_it(tmp_path: Path) -> None:
         return refuse(seed) if seed == 2 else draw(seed)
 
     with pytest.raises(BadInput, match="seed 2 is refused"):
-        map_jobs(work, SEEDS, tmp_path, n_workers=1)
+        cached_jobs(work, SEEDS, tmp_path, n_workers=1)
     assert numbers(tmp_path).keys() == {"part-0", "part-1"}
 
 
@@ -200,20 +130,32 @@ def test_a_failing_job_keeps_the_parts_before_it(tmp_path: Path) -> None:
 
 def test_two_processes_leave_the_same_numbers_as_one(tmp_path: Path) -> None:
     done: list[str] = []
-    map_jobs(draw, SEEDS, tmp_path / "one", n_workers=1)
-    map_jobs(draw, SEEDS, tmp_path / "two", n_workers=2, on_done=done.append)
+    cached_jobs(draw, SEEDS, tmp_path / "one", n_workers=1)
+    cached_jobs(draw, SEEDS, tmp_path / "two", n_workers=2, on_done=done.append)
     assert numbers(tmp_path / "two") == numbers(tmp_path / "one")
     assert numbers(tmp_path / "one").keys() == SEEDS.keys()
-    assert processes(tmp_path / "one") == {os.getpid()}
+    assert processes(tmp_path / "one") == {os.getpid()}, "one worker is this process"
+    assert os.getpid() not in processes(tmp_path / "two")
     assert sorted(done) == sorted(SEEDS)
 
 
-def test_what_the_jobs_share_is_sent_to_a_worker_once_and_not_with_each_job(tmp_path: Path) -> None:
+@pytest.mark.parametrize("n_workers", [1, 2])
+def test_jobs_without_a_cache_yield_their_results_by_name_and_leave_no_file(
+    n_workers: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    results = dict(run_jobs(draw, SEEDS, n_workers=n_workers))
+    assert results.keys() == SEEDS.keys()
+    for name, seed in SEEDS.items():
+        np.testing.assert_array_equal(results[name]["product"], draw(seed)["product"])
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_the_jobs_share_is_sent_to_each_worker_once_and_not_with_each_job(tmp_path: Path) -> None:
     Shared.n_sent = 0
-    work = partial(draw_once_all_others_are_drawn, Shared(), os.getpid(), tmp_path / "two")
-    map_jobs(work, SEEDS, tmp_path / "two", n_workers=2)
-    assert Shared.n_sent == 1
-    map_jobs(draw, SEEDS, tmp_path / "one", n_workers=1)
+    cached_jobs(partial(draw_with, Shared()), SEEDS, tmp_path / "two", n_workers=2)
+    assert Shared.n_sent == 2
+    cached_jobs(draw, SEEDS, tmp_path / "one", n_workers=1)
     assert numbers(tmp_path / "two") == numbers(tmp_path / "one")
 
 
@@ -223,75 +165,71 @@ def test_workers_use_one_thread_each_and_this_process_keeps_its_setting(
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
     (tmp_path / "present").mkdir()
-    map_jobs(read_n_threads, dict.fromkeys("ab", tmp_path / "present"), tmp_path, n_workers=2)
+    cached_jobs(read_n_threads, dict.fromkeys("ab", tmp_path / "present"), tmp_path, n_workers=2)
     parts = [read_arrays(path) or {} for path in tmp_path.glob("*.npz")]
-    (worker,) = (part for part in parts if part["process"] != os.getpid())
-    assert list(worker["threads"]) == [1, 1, 1]
+    assert [list(part["threads"]) for part in parts] == [[1, 1, 1], [1, 1, 1]]
     assert os.environ["OMP_NUM_THREADS"] == "2"
     assert "MKL_NUM_THREADS" not in os.environ
 
 
-def test_this_process_is_one_of_the_workers(tmp_path: Path) -> None:
-    (tmp_path / "present").mkdir()
-    map_jobs(wait_for_two, dict.fromkeys("ab", tmp_path / "present"), tmp_path, n_workers=2)
-    assert os.getpid() in processes(tmp_path)
-    assert len(processes(tmp_path)) == 2
-
-
-def test_a_script_needs_no_main_guard(tmp_path: Path) -> None:
+def test_a_script_needs_no_main_guard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     script = tmp_path / "script.py"
     script.write_text(
-        "import sys; from pathlib import Path; from zest_rl.runtime.parallel import map_jobs\n"
+        "import sys; from pathlib import Path; from zest_rl.runtime.parallel import cached_jobs\n"
         "from test_parallel import draw\n"
         "print('begun')\n"
-        "map_jobs(draw, {str(i): i for i in range(4)}, Path(sys.argv[1]), n_workers=2)\n"
+        "cached_jobs(draw, {str(i): i for i in range(4)}, Path(sys.argv[1]), n_workers=2)\n"
     )
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
     command = [sys.executable, str(script), str(tmp_path)]
-    assert subprocess.run(command, env=environment, timeout=60, capture_output=True, text=True).stdout == "begun\n"
+    assert subprocess.run(command, timeout=60, capture_output=True, text=True).stdout == "begun\n"
     assert len(list(tmp_path.glob("*.npz"))) == 4
 
 
 def test_a_killed_worker_is_a_clear_error_and_finished_parts_are_kept(tmp_path: Path) -> None:
-    jobs = dict.fromkeys("abcd", os.getpid())
+    work = partial(be_killed_after_the_first, os.getpid(), tmp_path)
     with pytest.raises(ZestError, match=r"a worker process died .*finished parts are kept, run the same command again"):
-        map_jobs(be_killed_elsewhere, jobs, tmp_path, n_workers=2)
+        cached_jobs(work, SEEDS, tmp_path, n_workers=2)
     finished = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
     assert 1 <= len(finished) <= 3
-    map_jobs(be_killed_elsewhere, jobs, tmp_path, n_workers=1)
+    cached_jobs(work, SEEDS, tmp_path, n_workers=1)
     assert {path: path.stat().st_mtime_ns for path in finished} == finished
     assert len(list(tmp_path.iterdir())) == 4
 
 
 def test_an_error_of_a_worker_arrives_as_what_it_is(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"seed \d is refused"):
-        map_jobs(refuse, SEEDS, tmp_path, n_workers=2)
+        cached_jobs(refuse, SEEDS, tmp_path, n_workers=2)
 
 
 def test_work_that_cannot_be_sent_is_an_error_and_no_wait(tmp_path: Path) -> None:
     with pytest.raises(Exception, match=r"(?i)pickle|local object"):
-        map_jobs(counted([]), SEEDS, tmp_path, n_workers=3)
+        cached_jobs(counted([]), SEEDS, tmp_path, n_workers=3)
 
 
-def test_workers_end_with_a_killed_command(tmp_path: Path) -> None:
+@pytest.mark.parametrize("end", [os.kill, os.killpg], ids=["killed", "interrupted"])
+def test_workers_end_with_a_command_that_is_killed_or_interrupted(
+    end: Callable[[int, signal.Signals], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     hearts = [tmp_path / "heart-0", tmp_path / "heart-1"]
     code = (
-        "import sys; from pathlib import Path; from zest_rl.runtime.parallel import map_jobs\n"
+        "import sys; from pathlib import Path; from zest_rl.runtime.parallel import cached_jobs\n"
         "from test_parallel import beat\n"
         "folder = Path(sys.argv[1])\n"
-        "map_jobs(beat, {str(i): folder / f'heart-{i}' for i in range(2)}, folder, n_workers=2)"
+        "cached_jobs(beat, {str(i): folder / f'heart-{i}' for i in range(5)}, folder, n_workers=2)"
     )
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    command = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], env=environment)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
+    command = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], start_new_session=True)
     deadline = time.monotonic() + 60
     while not all(heart.exists() for heart in hearts) and time.monotonic() < deadline:
         time.sleep(0.05)
-    command.send_signal(signal.SIGKILL)
-    command.wait()
+    end(command.pid, signal.SIGKILL if end is os.kill else signal.SIGINT)  # Ctrl-C is a signal to all processes
+    command.wait(timeout=20)
     time.sleep(0.5)
     beats = [heart.stat().st_size for heart in hearts]
     time.sleep(0.5)
     assert [heart.stat().st_size for heart in hearts] == beats
+    assert set(tmp_path.iterdir()) == set(hearts), "no other job was begun"
 
 
 # --- small pieces -----------------------------------------------------------------------------------------------------
@@ -302,12 +240,6 @@ def test_chunks_cover_everything_once_and_in_order(n: int, size: int) -> None:
     parts = chunks(n, size)
     assert [i for part in parts for i in part] == list(range(n))
     assert all(0 < len(part) <= size for part in parts)
-
-
-def test_parts_are_joined_along_the_first_axis() -> None:
-    joined = concatenate([{"a": np.ones((2, 3)), "b": np.zeros(2)}, {"a": np.zeros((1, 3)), "b": np.ones(1)}])
-    assert joined["a"].shape == (3, 3)
-    np.testing.assert_array_equal(joined["b"], [0, 0, 1])
 
 
 def test_torch_runs_on_one_thread_within_the_context_and_as_before_after_a_failure() -> None:

@@ -23,7 +23,8 @@ from zest_rl.metrics.selection import others
 from zest_rl.metrics.statistics import Values
 from zest_rl.rewards.scores import Features, Similarity, score_views
 from zest_rl.runtime import artifacts
-from zest_rl.runtime.parallel import one_thread, read_arrays, write_arrays
+from zest_rl.runtime.arrays import read_arrays, write_arrays
+from zest_rl.runtime.parallel import one_thread
 from zest_rl.types import FloatArray
 
 OPENING = "Opening [something]"

@@ -27,7 +27,7 @@ from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return, wilson
 from zest_rl.rewards.relabel import SCORER_FILE, Reward
 from zest_rl.rewards.scorer import Scorer
 from zest_rl.runtime import artifacts
-from zest_rl.runtime.parallel import chunks, map_jobs, one_thread, read_parts
+from zest_rl.runtime.parallel import cached_jobs, chunks, one_thread, read_parts
 from zest_rl.types import EpisodeResult
 
 Rtg = Literal["online", "constant", "schedule"]
@@ -286,7 +286,7 @@ def evaluate(
     for part in chunks(config.n_episodes, max(EPISODES_PER_JOB, config.n_episodes // N_JOBS)):
         seeds = range(config.seed + part.start, config.seed + part.stop)
         jobs[f"seeds-{seeds.start}-{seeds.stop}{'-scored' if scored else ''}"] = (run, config, seeds, scored, device)
-    map_jobs(
+    cached_jobs(
         _evaluate_part,
         jobs,
         folder / "parts",

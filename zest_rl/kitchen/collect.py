@@ -24,7 +24,8 @@ from zest_rl.kitchen.experts import DONE_PROGRESS, Manner, add_uniform_noise, ma
 from zest_rl.kitchen.tasks import get_task
 from zest_rl.metrics import statistics
 from zest_rl.runtime import artifacts
-from zest_rl.runtime.parallel import chunks, concatenate, map_jobs, read_parts
+from zest_rl.runtime.arrays import concatenate
+from zest_rl.runtime.parallel import cached_jobs, chunks, read_parts
 from zest_rl.types import FloatArray
 
 EPISODES_PER_JOB = 5
@@ -165,7 +166,7 @@ def run_behaviour(
     for part in chunks(n_episodes, EPISODES_PER_JOB):
         indices = range(first + part.start, first + part.stop)
         jobs[f"episodes-{indices.start}-{indices.stop}"] = (behaviour, indices)
-    map_jobs(
+    cached_jobs(
         _rollouts,
         jobs,
         folder,

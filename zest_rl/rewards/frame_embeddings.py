@@ -31,7 +31,8 @@ from zest_rl.rewards.scores import (
 )
 from zest_rl.rewards.state_embeddings import check_same_embedder, shared_embedder
 from zest_rl.runtime import artifacts
-from zest_rl.runtime.parallel import Engine, counted, map_jobs, one_thread, read_arrays
+from zest_rl.runtime.arrays import read_arrays
+from zest_rl.runtime.parallel import Engine, cached_jobs, counted, one_thread
 from zest_rl.sources.base import Frames, Source
 from zest_rl.types import FloatArray
 
@@ -145,7 +146,7 @@ class FrameScorer:
             for i, digest in enumerate(digests)
             if not self._path(digest).exists()
         }
-        map_jobs(
+        cached_jobs(
             partial(_embed_episode, shared),
             jobs,
             self._folder,

@@ -31,7 +31,8 @@ from zest_rl.rewards.scores import (
 )
 from zest_rl.rewards.state_embeddings import EmbedConfig, StateEmbedder
 from zest_rl.runtime import artifacts
-from zest_rl.runtime.parallel import Engine, one_thread, read_arrays, write_arrays
+from zest_rl.runtime.arrays import read_arrays, write_arrays
+from zest_rl.runtime.parallel import Engine, one_thread
 from zest_rl.simulation.views import Views, canonical_states, scene_pair
 from zest_rl.types import FloatArray
 

@@ -20,15 +20,8 @@ from numpy.typing import NDArray
 from zest_rl.embedders import Embedder, Precision, load_embedder
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
-from zest_rl.runtime.parallel import (
-    Engine,
-    chunks,
-    counted,
-    map_jobs,
-    one_thread,
-    read_array,
-    write_arrays,
-)
+from zest_rl.runtime.arrays import read_array, write_arrays
+from zest_rl.runtime.parallel import Engine, cached_jobs, chunks, counted, one_thread
 from zest_rl.simulation.views import Views, canonical_states, distinct_states, state_keys
 from zest_rl.types import FloatArray
 
@@ -136,7 +129,7 @@ class StateEmbedder:
         for chunk in chunks(len(missing), STATES_PER_SHARD):
             part = missing[chunk.start : chunk.stop]
             jobs[artifacts.hash_arrays(part)[:20]] = _Job(self.config, part, self.embedder.fingerprint)
-        map_jobs(
+        cached_jobs(
             _embed_states,
             jobs,
             self.folder,

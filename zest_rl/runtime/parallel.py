@@ -1,4 +1,7 @@
-"""Work in chunks: one process per core, one file per finished chunk, so that a cut run goes on where it stopped."""
+"""Jobs side by side: one process per core, and one file per finished job, so that a cut run goes on where it stopped.
+
+`run_jobs` yields what jobs return; `cached_jobs` leaves it on disk, and does nothing twice.
+"""
 
 from __future__ import annotations
 
@@ -7,26 +10,24 @@ import multiprocessing
 import os
 import sys
 import threading
-import zipfile
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
 from types import ModuleType
 from typing import Any, Literal, get_args
 
-import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.errors import BadInput, ZestError, nearest
-from zest_rl.runtime import artifacts, ray_engine
-from zest_rl.runtime.ray_engine import Arrays, Job
+from zest_rl.runtime import ray_engine
+from zest_rl.runtime.arrays import Arrays, concatenate, read_arrays, write_arrays
+from zest_rl.runtime.ray_engine import Job, Result
 
 Engine = Literal["local", "ray"]
+"""Processes of this machine, or workers of a Ray cluster (`zest_rl.runtime.ray_engine`)."""
 _STARTING = threading.Lock()
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -57,18 +58,17 @@ def starting_children() -> Iterator[None]:
     when a script does its work there without ``if __name__ == "__main__"``; what we send it needs no such import.
     """
     with _STARTING:
-        main, before = sys.modules["__main__"], {name: os.environ.get(name) for name in THREAD_VARIABLES}
+        main = sys.modules["__main__"]
+        before = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
         os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
         sys.modules["__main__"] = ModuleType("__main__")
         try:
             yield
         finally:
             sys.modules["__main__"] = main
-            for name, value in before.items():
-                if value is None:
-                    del os.environ[name]
-                else:
-                    os.environ[name] = value
+            for name in THREAD_VARIABLES:
+                del os.environ[name]
+            os.environ.update(before)
 
 
 @contextmanager
@@ -84,60 +84,89 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-DAMAGED = (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile)
-"""What reading a damaged ``.npz`` file may raise; RuntimeError: damaged zip flags."""
-
-
-def read_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
-    """Read an ``.npz`` file whole, or return None when it is missing or damaged."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except DAMAGED:
-        return None
-
-
-def read_array(path: Path, name: str) -> NDArray[Any] | None:
-    """Read one array of an ``.npz`` file, or return None when it is missing or damaged."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return np.asarray(file[name])
-    except (*DAMAGED, KeyError):
-        return None
-
-
-def write_arrays(path: Path, arrays: Arrays) -> None:
-    """Write an ``.npz`` file atomically."""
-    artifacts.check_free_space(path.parent, sum(array.nbytes for array in arrays.values()))
-    with artifacts.atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, allow_pickle=False, **dict(arrays))
-
-
 def counted(
     on_progress: Callable[[int, int], None] | None, total: int, n_done: int = 0
 ) -> Callable[[str], None] | None:
-    """Return what `map_jobs` may call after each job, to tell `on_progress` of (jobs done, jobs in all)."""
+    """Return what `cached_jobs` may call after each job, to tell `on_progress` of (jobs done, jobs in all)."""
     if on_progress is None:
         return None
     numbers = itertools.count(n_done + 1)
     return lambda _: on_progress(next(numbers), total)
 
 
-_WORK: list[Callable[[Any], Arrays]] = []
+def run_jobs(
+    work: Callable[[Job], Result],
+    jobs: Mapping[str, Job],
+    *,
+    n_workers: int | None = None,
+    engine: Engine = "local",
+    device: str = "cpu",
+) -> Generator[tuple[str, Result], None, None]:
+    """Yield the name and the result of ``work(job)`` for every job, the first that is done first.
+
+    A single local worker is this process; several are processes of their own, which use one thread each.
+
+    Args:
+        work: a module-level function, or a partial of one with what all jobs share (it is sent to each worker once).
+        jobs: name → job; jobs and results are picklable.
+        n_workers: number of workers, default one per core.
+        engine: where the workers are.
+        device: what the work runs on; Ray gives its workers GPUs by it.
+
+    Raises:
+        BadInput: `n_workers` is below 1, or there is no such engine.
+        ZestError: a worker died (out of memory, killed).
+    """
+    if n_workers is not None and n_workers < 1:
+        raise BadInput(f"the number of workers must be at least 1, got {n_workers}; leave it out for one per core")
+    if engine not in get_args(Engine):
+        raise BadInput(f"unknown engine {engine!r}; {nearest(engine, get_args(Engine))}")
+    if engine == "ray":
+        yield from ray_engine.run_jobs(work, jobs, n_workers=n_workers, device=device)
+    elif (n_processes := min(n_workers or n_cores(), len(jobs))) > 1:
+        yield from _run_in_pool(work, jobs, n_processes)
+    else:
+        for name, job in jobs.items():
+            yield name, work(job)
+
+
+_WORK: list[Callable[[Any], Any]] = []
 """Of this worker process."""
 
 
-def _start_worker(work: Callable[[Any], Arrays]) -> None:
+def _start_worker(work: Callable[[Any], Any]) -> None:
     die_with_parent()
     _WORK.append(work)
 
 
-def _run_job(job: Any, path: Path) -> None:
-    """Do a job in a worker process."""
-    write_arrays(path, _WORK[0](job))
+def _do(job: Any) -> Any:
+    return _WORK[0](job)
 
 
-def map_jobs(
+def _run_in_pool(
+    work: Callable[[Job], Result], jobs: Mapping[str, Job], n_processes: int
+) -> Generator[tuple[str, Result], None, None]:
+    waiting = iter(jobs.items())
+    running: dict[Future[Result], str] = {}  # never more than processes, as what a pool has taken it does to the end
+    context = multiprocessing.get_context("spawn")  # fork is unsafe beside torch's and the GL library's threads
+    with ProcessPoolExecutor(n_processes, context, _start_worker, (work,)) as pool:
+        try:
+            while True:
+                with starting_children():  # submitting starts them
+                    for name, job in itertools.islice(waiting, n_processes - len(running)):
+                        running[pool.submit(_do, job)] = name
+                if not running:
+                    return
+                done = next(as_completed(running))
+                yield running.pop(done), done.result()
+        except BrokenProcessPool as error:
+            raise ZestError(
+                f"a worker process died before all of {len(jobs)} parts were done (killed, or out of memory); "
+                "finished parts are kept, run the same command again to go on"
+            ) from error
+
+
+def cached_jobs(
     work: Callable[[Job], Arrays],
     jobs: Mapping[str, Job],
     folder: Path,
@@ -149,103 +178,44 @@ def map_jobs(
 ) -> None:
     """Leave the arrays of ``work(job)`` in ``folder/NAME.npz`` for every job; what is there already is not done again.
 
+    Local workers write their results themselves; those of a cluster may have other disks, so this process writes.
+
     Args:
-        work: a module-level function, or a partial of one with what all jobs share (it is sent to each worker process
-            once); it must depend on nothing but that and its job.
+        work: as for `run_jobs`; it must depend on nothing but its job and what it is a partial of.
         jobs: name → job. The name must identify the job's content.
         folder: where results are left.
-        n_workers: number of processes, default one per core; this process is one of them.
-        engine: processes of this machine, or workers of a Ray cluster (`zest_rl.runtime.ray_engine`).
-        device: what the work runs on; Ray gives its workers GPUs by it.
+        n_workers: as for `run_jobs`.
+        engine: as for `run_jobs`.
+        device: as for `run_jobs`.
         on_done: called with the name of each job when its file is there, also for those found finished.
 
     Raises:
         BadInput: `n_workers` is below 1, or there is no such engine.
-        ZestError: a worker process died (out of memory, killed). What was finished is kept.
+        ZestError: a worker died (out of memory, killed). What was finished is kept.
     """
-    if n_workers is not None and n_workers < 1:
-        raise BadInput(f"the number of workers must be at least 1, got {n_workers}; leave it out for one per core")
-    if engine not in get_args(Engine):
-        raise BadInput(f"unknown engine {engine!r}; {nearest(engine, get_args(Engine))}")
-    missing = []
-    for name in jobs:
+    tell = on_done or (lambda name: None)
+    missing = {}
+    for name, job in jobs.items():
         if read_arrays(folder / f"{name}.npz") is None:
-            missing.append(name)
-        elif on_done is not None:
-            on_done(name)
-    run = _run_on_ray if engine == "ray" else _run_here
-    with closing(run(work, {name: jobs[name] for name in missing}, folder, n_workers, device)) as done:
-        for name in done:
-            if on_done is not None:
-                on_done(name)
-
-
-def _run_on_ray(
-    work: Callable[[Job], Arrays], jobs: Mapping[str, Job], folder: Path, n_workers: int | None, device: str
-) -> Generator[str, None, None]:
-    with closing(ray_engine.run_jobs(work, jobs, n_workers=n_workers, device=device)) as results:
+            missing[name] = (name, job)
+        else:
+            tell(name)
+    do = partial(_do_named, work, None if engine == "ray" else folder)
+    with closing(run_jobs(do, missing, n_workers=n_workers, engine=engine, device=device)) as results:
         for name, arrays in results:
-            write_arrays(folder / f"{name}.npz", arrays)
-            yield name
+            if arrays is not None:
+                write_arrays(folder / f"{name}.npz", arrays)
+            tell(name)
 
 
-def _run_here(
-    work: Callable[[Job], Arrays], jobs: Mapping[str, Job], folder: Path, n_workers: int | None, device: str
-) -> Generator[str, None, None]:
-    """Do all jobs in this process and ``n_workers - 1`` others; the work chooses its device itself."""
-    n_workers = min(n_workers or n_cores(), len(jobs))
-    paths = {name: folder / f"{name}.npz" for name in jobs}
-    todo = deque(jobs)
-    finished: SimpleQueue[tuple[str, BaseException | None]] = SimpleQueue()
-
-    def take() -> str | None:
-        """Return the next job that nobody has begun; other threads take from the same list."""
-        try:
-            return todo.popleft()
-        except IndexError:
-            return None
-
-    def submit() -> None:
-        """Give the next job to another process, and when it is done another one, and so on."""
-        if (name := take()) is None:
-            return
-        try:
-            pool.submit(_run_job, jobs[name], paths[name]).add_done_callback(partial(go_on, name))
-        except BrokenProcessPool as error:
-            finished.put((name, error))
-
-    all_started = threading.Event()
-
-    def go_on(name: str, future: Future[None]) -> None:
-        if future.exception() is None:
-            all_started.wait()  # a process that is started from here would be outside of `starting_children`
-            submit()
-        finished.put((name, future.exception()))
-
-    context = multiprocessing.get_context("spawn")  # fork is unsafe beside torch's and the GL library's threads
-    with ProcessPoolExecutor(
-        max(n_workers - 1, 1), mp_context=context, initializer=_start_worker, initargs=(work,)
-    ) as pool:
-        with starting_children():  # submitting starts them
-            for _ in range(n_workers - 1):
-                submit()
-        all_started.set()
-        try:
-            for _ in jobs:
-                if finished.empty() and (own := take()) is not None:
-                    write_arrays(paths[own], work(jobs[own]))
-                    finished.put((own, None))
-                name, error = finished.get()
-                if error is not None:
-                    raise error
-                yield name
-        except BrokenProcessPool as error:
-            raise ZestError(
-                f"a worker process died before all of {len(jobs)} parts were done (killed, or out of memory); "
-                "finished parts are kept, run the same command again to go on"
-            ) from error
-        finally:
-            todo.clear()
+def _do_named(work: Callable[[Job], Arrays], folder: Path | None, named: tuple[str, Job]) -> Arrays | None:
+    """Do a job, and leave its arrays in the folder or return them."""
+    name, job = named
+    arrays = work(job)
+    if folder is None:
+        return arrays
+    write_arrays(folder / f"{name}.npz", arrays)
+    return None
 
 
 def chunks(n: int, size: int) -> list[range]:
@@ -254,7 +224,7 @@ def chunks(n: int, size: int) -> list[range]:
 
 
 def read_parts(folder: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """Join what `map_jobs` left for these jobs along the first axis.
+    """Join what `cached_jobs` left for these jobs along the first axis.
 
     Raises:
         ZestError: a part is missing or damaged.
@@ -265,8 +235,3 @@ def read_parts(folder: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
         gone = [name for name, part in parts.items() if part is None]
         raise ZestError(f"parts of {folder} are missing or damaged ({', '.join(gone)}); run the command again")
     return concatenate(found)
-
-
-def concatenate(parts: Sequence[Arrays]) -> dict[str, NDArray[Any]]:
-    """Join equally named arrays of several parts along the first axis."""
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

@@ -1,4 +1,4 @@
-"""Jobs on a Ray cluster: the other engine of `zest_rl.runtime.parallel.map_jobs`. Needs the extra ``ray``.
+"""Jobs on a Ray cluster: the other engine of `zest_rl.runtime.parallel`. Needs the extra ``ray``.
 
 Each worker is a Ray actor: a process with a core, and a GPU of its own, for as long as there is work. Ray starts one
 that died anew and repeats its job. Results come back to the process that asked, which alone writes them. Ray Data, made
@@ -15,12 +15,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from numpy.typing import NDArray
-
 from zest_rl.errors import BadInput, ZestError
 
 Job = TypeVar("Job")
-Arrays = Mapping[str, NDArray[Any]]
+Result = TypeVar("Result")
 MAX_RETRIES = 3
 """How often a job is begun again whose worker died."""
 HANDED_ON = ("ZEST_", "MINARI_", "HF_", "TORCH_HOME", "MUJOCO_GL")
@@ -30,7 +28,7 @@ HANDED_ON = ("ZEST_", "MINARI_", "HF_", "TORCH_HOME", "MUJOCO_GL")
 class _Worker:
     """What an actor runs."""
 
-    def __init__(self, work: Callable[[Any], Arrays], folder: str) -> None:
+    def __init__(self, work: Callable[[Any], Any], folder: str) -> None:
         self._work = work
         with suppress(FileNotFoundError):  # so that relative paths mean the same, where this node has the folder
             os.chdir(folder)
@@ -38,18 +36,18 @@ class _Worker:
     def start(self) -> None:
         """Return when the actor is there."""
 
-    def do(self, job: Any) -> Arrays | Exception:
+    def do(self, name: str, job: Any) -> tuple[str, Any]:
         """Do a job; a refusal is a result too, so that Ray does not wrap it."""
         try:
-            return dict(self._work(job))
+            return name, self._work(job)
         except Exception as error:
-            return error
+            return name, error
 
 
 def run_jobs(
-    work: Callable[[Job], Arrays], jobs: Mapping[str, Job], *, n_workers: int | None = None, device: str = "cpu"
-) -> Generator[tuple[str, Arrays], None, None]:
-    """Yield the name and the arrays of ``work(job)`` for every job, the first that is done first.
+    work: Callable[[Job], Result], jobs: Mapping[str, Job], *, n_workers: int | None = None, device: str = "cpu"
+) -> Generator[tuple[str, Result], None, None]:
+    """Yield the name and the result of ``work(job)`` for every job, the first that is done first.
 
     The cluster is that of ``RAY_ADDRESS``, or of the caller's own ``ray.init``; else one is started on this machine for
     the time of the work.
@@ -74,6 +72,7 @@ def run_jobs(
         return
     import ray
     from ray.exceptions import RayError
+    from ray.util import ActorPool
 
     with _cluster(n_workers):
         there = ray.cluster_resources()  # type: ignore[no-untyped-call]
@@ -84,19 +83,18 @@ def run_jobs(
         as_actor = ray.remote(num_cpus=1, num_gpus=min(n_gpus, 1), max_restarts=-1, max_task_retries=MAX_RETRIES)
         actor_class: Any = as_actor(_Worker)
         actors = [actor_class.remote(work, str(Path.cwd())) for _ in range(min(n_workers or most, most, len(jobs)))]
-        todo = iter(jobs)
-        busy: dict[Any, tuple[Any, str | None]] = {actor.start.remote(): (actor, None) for actor in actors}
+        pool: Any = ActorPool(actors)
         try:
-            while busy:
-                (done, *_), _ = ray.wait(list(busy), num_returns=1)
-                actor, finished = busy.pop(done)
-                result = ray.get(done)
-                if (name := next(todo, None)) is not None:
-                    busy[actor.do.remote(jobs[name])] = (actor, name)
-                if isinstance(result, Exception):
-                    raise result
-                if finished is not None:
-                    yield finished, result
+            for _ in actors:  # jobs go only to those that have started: a busy cluster may have no place for the others
+                pool.submit(lambda actor, _: actor.start.remote(), None)
+            for job in jobs.items():
+                pool.submit(lambda actor, job: actor.do.remote(*job), job)
+            while pool.has_next():
+                if (done := pool.get_next_unordered()) is not None:
+                    name, result = done
+                    if isinstance(result, Exception):
+                        raise result
+                    yield name, result
         except RayError as error:
             raise ZestError(
                 f"Ray could not finish the work ({type(error).__name__}: {error}); finished parts are kept, run the "

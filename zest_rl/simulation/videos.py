@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zest_rl.runtime import artifacts
-from zest_rl.runtime.parallel import map_jobs
+from zest_rl.runtime.parallel import run_jobs
 from zest_rl.simulation.rendering import Camera, RenderConfig, shared_renderer
 
 SCENE = Camera(lookat=(-0.4, 0.3, 1.9), distance=2.4, azimuth=60.0, elevation=-25.0)
@@ -76,14 +75,9 @@ def ensure_videos(
     Raises:
         ZestError: a process died; finished videos are kept.
     """
-    jobs = {artifacts.hash_json(str(path)): video for path, video in missing(videos).items()}
-    with tempfile.TemporaryDirectory() as scratch:
-        map_jobs(_write, jobs, Path(scratch), n_workers=n_workers, on_done=lambda _: on_done())
-
-
-def _write(video: Video) -> dict[str, NDArray[np.generic]]:
-    write_video(video)
-    return {}
+    jobs = {str(path): video for path, video in missing(videos).items()}
+    for _ in run_jobs(write_video, jobs, n_workers=n_workers):
+        on_done()
 
 
 def representative(returns: NDArray[np.float64]) -> dict[str, int]:

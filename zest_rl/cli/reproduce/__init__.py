@@ -309,7 +309,7 @@ def _work(cell: Cell) -> dict[str, Any]:
 
 def run_cells(cells: list[Cell], output: Path, ui: Ui, *, n_workers: int | None = None) -> int:
     """Train and evaluate all cells that are not done; return how many were not."""
-    from zest_rl.runtime.parallel import map_jobs
+    from zest_rl.runtime.parallel import cached_jobs
 
     done_folder = output / "done"
     open_cells = {cell.name: cell for cell in cells if not _is_done(cell, done_folder)}
@@ -318,7 +318,7 @@ def run_cells(cells: list[Cell], output: Path, ui: Ui, *, n_workers: int | None 
         ui.progress("updates of all cells (evaluation follows)", total) as advance,
         _TrainingWatch({cell.run for cell in open_cells.values()}, advance),
     ):
-        map_jobs(_work, open_cells, done_folder, n_workers=n_workers, on_done=lambda name: ui.say(f"done: {name}"))
+        cached_jobs(_work, open_cells, done_folder, n_workers=n_workers, on_done=lambda name: ui.say(f"done: {name}"))
     return len(open_cells)
 
 
@@ -372,7 +372,7 @@ def _updates_done(log: Path) -> int:
 
 def _seconds(cell: Cell, output: Path) -> dict[str, float]:
     from zest_rl.runtime import artifacts
-    from zest_rl.runtime.parallel import read_arrays
+    from zest_rl.runtime.arrays import read_arrays
 
     meta = artifacts.read_json(cell.run / "meta.json")
     times = {"train_seconds": meta["train_seconds"]} if "train_seconds" in meta else {}
