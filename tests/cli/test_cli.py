@@ -107,7 +107,7 @@ def test_the_help_of_every_verb_imports_nothing_heavy(verb: str) -> None:
 def test_every_verb_describes_itself_and_its_arguments(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["doctor", "--help"]) == 0
     out = capsys.readouterr().out
-    assert "say how to mend" in out
+    assert "say how to fix" in out
     assert "--recipe FILE.toml" in out
 
 

