@@ -26,14 +26,16 @@ from zest_rl.data import reader
 from zest_rl.data.writer import write_dataset
 from zest_rl.kitchen import collect
 from zest_rl.rewards import state_embeddings
-from zest_rl.rewards.relabel import relabel
-from zest_rl.rewards.scorer import Scorer, ScorerConfig
-from zest_rl.rewards.state_embeddings import STATES_PER_SHARD
+from zest_rl.rewards.relabel import relabel_source
+from zest_rl.rewards.scorer import ScorerConfig
+from zest_rl.rewards.state_embeddings import STATES_PER_SHARD, EmbedConfig, StateEmbedder
+from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import concatenate, write_arrays
 from zest_rl.runtime.parallel import chunks, one_thread
 from zest_rl.simulation.rendering import select_gl_backend
 from zest_rl.simulation.views import Views, distinct_states
+from zest_rl.sources.kitchen import kitchen_source
 
 REQUIRED_RATIO = 25.0
 REQUIRED_RESCORING_S = 2.0
@@ -41,7 +43,8 @@ N_PLAIN_FRAMES = 5
 N_ROUNDS = 3
 N_RELABELED, N_RESCORED = 4, 60
 DATASET = "zest/kitchen-micro-benchmark-v0"
-CONFIG = ScorerConfig(Views("micro", n_views=8), goal="same-scene")
+VIEWS = Views("micro", n_views=8)
+CONFIG = ScorerConfig("same-scene")
 OTHERS = {
     "goal": replace(CONFIG, goal="drawings"),
     "features": replace(CONFIG, features="raw"),
@@ -88,8 +91,8 @@ def plain_ms() -> float:
     return 1e3 * seconds / N_PLAIN_FRAMES
 
 
-def relabel_ms(episodes: dict[str, NDArray[Any]]) -> tuple[Scorer, float, float]:
-    """Return the scorer, cpu-ms per frame and view, and cpu-ms per *distinct* state and view."""
+def relabel_ms(episodes: dict[str, NDArray[Any]]) -> tuple[float, float]:
+    """Return cpu-ms per frame and view, and cpu-ms per *distinct* state and view."""
     write_dataset(
         DATASET,
         collect.recordings(episodes),
@@ -101,20 +104,22 @@ def relabel_ms(episodes: dict[str, NDArray[Any]]) -> tuple[Scorer, float, float]
         zest={},
     )
     start = cpu_seconds()
-    made = relabel(DATASET, CONFIG, n_workers=1)
-    milliseconds = 1e3 * (cpu_seconds() - start) / CONFIG.views.n_views
+    made = relabel_source(kitchen_source(DATASET, VIEWS), CONFIG, n_workers=1)
+    milliseconds = 1e3 * (cpu_seconds() - start) / VIEWS.n_views
     assert np.ptp([episode.rewards.sum() for episode in reader.read_episodes(made.dataset_id)]) > 0
-    return made.scorer, milliseconds / made.n_frames, milliseconds / made.scorer.states.n_embedded
+    return milliseconds / made.n_frames, milliseconds / made.n_embedded
 
 
-def fill_cache(scorer: Scorer, states: NDArray[np.float64], vectors: NDArray[np.float32]) -> int:
-    """Put all of `states` (N, 30) into the scorer's cache with (n, V, D) `vectors` in turn; return how many differ."""
-    distinct = distinct_states(states, scorer.config.views)
-    for path in scorer.states.folder.glob("*.npz"):
+def fill_cache(embedded: NDArray[np.float64], states: NDArray[np.float64]) -> int:
+    """Give all of `states` (N, 30) the embeddings of those that are `embedded`, in turn; return how many differ."""
+    cache = StateEmbedder(EmbedConfig(VIEWS, CONFIG.embedder))
+    vectors = cache.embedded(embedded).embeddings[1:]
+    distinct = distinct_states(states, VIEWS)
+    for path in cache.folder.glob("*.npz"):
         path.unlink()
     for part in chunks(len(distinct), STATES_PER_SHARD):
         keys = distinct[part.start : part.stop]
-        path = scorer.states.folder / f"{artifacts.hash_arrays(keys)[:20]}.npz"
+        path = cache.folder / f"{artifacts.hash_arrays(keys)[:20]}.npz"
         write_arrays(path, {"keys": keys, "embeddings": vectors[np.arange(part.start, part.stop) % len(vectors)]})
     return len(distinct)
 
@@ -129,10 +134,10 @@ def rescoring_seconds(config: ScorerConfig, episodes: list[NDArray[np.float64]])
         shutil.rmtree(artifacts.cache_dir() / "goals", ignore_errors=True)
         state_embeddings._read_shard.cache_clear()
         start = cpu_seconds()
-        scorer = Scorer.build(config, episodes[0][0], n_workers=1)
-        scores, _ = scorer.score_episodes(episodes)
+        scorer = StateScorer.build(config, VIEWS, episodes[0][0], n_workers=1)
+        scores, _ = scorer.scorer.score_episodes(scorer.embeddings(episodes))
         seconds.append(cpu_seconds() - start)
-        assert scorer.states.n_embedded == 0
+        assert scorer.embedder.n_embedded == 0
         assert all(np.isfinite(score).all() for score in scores)
     return min(seconds)
 
@@ -146,10 +151,9 @@ def run() -> dict[str, object]:
         try:
             plain = plain_ms()
             episodes = concatenate([collect.rollout(behaviour, index) for index in range(N_RESCORED)])
-            scorer, ours, per_state = relabel_ms({name: array[:N_RELABELED] for name, array in episodes.items()})
+            ours, per_state = relabel_ms({name: array[:N_RELABELED] for name, array in episodes.items()})
             states = list(episodes["qpos"])
-            vectors, _ = scorer.states.embedded(np.concatenate(states[:N_RELABELED]))
-            n_distinct = fill_cache(scorer, np.concatenate(states), vectors)
+            n_distinct = fill_cache(np.concatenate(states[:N_RELABELED]), np.concatenate(states))
             rescoring = {name: rescoring_seconds(config, states) for name, config in OTHERS.items()}
         finally:
             for name, value in before.items():

@@ -84,9 +84,10 @@ def trained_root(collected_root: Path, tmp_path_factory: pytest.TempPathFactory)
     are evaluated for `SHORT_HORIZON` steps.
     """
     from zest_rl.agents import AGENTS
-    from zest_rl.rewards.relabel import relabel
+    from zest_rl.rewards.relabel import relabel_source
     from zest_rl.rewards.scorer import ScorerConfig
     from zest_rl.simulation.views import Views
+    from zest_rl.sources.kitchen import kitchen_source
     from zest_rl.training.loop import TrainingConfig
     from zest_rl.training.runs import train
 
@@ -97,7 +98,7 @@ def trained_root(collected_root: Path, tmp_path_factory: pytest.TempPathFactory)
         patch.setenv("MINARI_DATASETS_PATH", str(root / "minari"))
         patch.setenv("ZEST_CACHE", str(root / "cache"))
         views = Views("micro", n_views=1, size=96, tolerance=0.05)
-        scored = relabel(COLLECTED, ScorerConfig(views, "same-scene"), n_workers=1).dataset_id
+        scored = relabel_source(kitchen_source(COLLECTED, views), ScorerConfig("same-scene"), n_workers=1).dataset_id
         for name, dataset in (("bc-0", scored), ("bc-1", scored), ("dt-0", scored), ("gt-0", COLLECTED)):
             agent, seed = "bc" if name.startswith("bc") else "dt", int(name[-1])
             config = TrainingConfig(n_updates=30, seed=seed, device="cpu", threads=1, log_every=10)

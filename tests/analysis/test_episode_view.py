@@ -7,8 +7,9 @@ import pytest
 
 from zest_rl.analysis.episode_view import N_FRAMES, Look
 from zest_rl.data import reader
-from zest_rl.rewards.scorer import Scorer, ScorerConfig
+from zest_rl.rewards.scorer import ScorerConfig
 from zest_rl.rewards.scores import Features
+from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.simulation.views import Views, canonical_states
 
 VIEWS = Views("micro", n_views=2, size=96, tolerance=0.05)
@@ -19,9 +20,9 @@ def test_an_episode_is_shown_with_its_scores_by_view_and_its_change_in_pixels(
     collected: str, goal: str, features: Features
 ) -> None:
     states = reader.read_states(collected)[0]
-    scorer = Scorer.build(ScorerConfig(VIEWS, goal, features=features), states[0], n_workers=1)
+    scorer = StateScorer.build(ScorerConfig(goal, features=features), VIEWS, states[0], n_workers=1)
     look = Look(scorer, states)
-    np.testing.assert_allclose(look.scores, scorer.score_episodes([states])[0][0], atol=1e-6)
+    np.testing.assert_allclose(look.scores, scorer.score_episode(states), atol=1e-6)
     assert look.by_view.shape == (2, len(states))
     assert not np.allclose(*look.by_view)
     if features != "progress":

@@ -14,10 +14,12 @@ from zest_rl.analysis.frame_selection import Candidates, draw_candidates, score_
 from zest_rl.data import reader
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.tasks import TASKS
-from zest_rl.rewards.scorer import Scorer, ScorerConfig
+from zest_rl.rewards.scorer import ScorerConfig
+from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.simulation.views import Views
 
-CONFIG = ScorerConfig(Views("micro", n_views=1, size=96, tolerance=0.05), "same-scene")
+VIEWS = Views("micro", n_views=1, size=96, tolerance=0.05)
+CONFIG = ScorerConfig("same-scene")
 MICRO = TASKS["micro"]
 
 
@@ -65,10 +67,10 @@ def test_the_context_is_of_the_same_or_always_of_another_trajectory(candidates: 
 
 
 def test_scores_are_the_scorer_s_and_find_the_open_door(candidates: Candidates) -> None:
-    scores = score_as_goals(candidates, CONFIG, n_workers=1)
-    scorer = Scorer.build(CONFIG, candidates.starts[0], n_workers=1)
+    scores = score_as_goals(candidates, CONFIG, VIEWS, n_workers=1)
+    scorer = StateScorer.build(CONFIG, VIEWS, candidates.starts[0], n_workers=1)
     expected = [
-        scorer.score_episodes([np.stack([candidates.starts[i], state])])[0][0][-1]
+        scorer.score_episode(np.stack([candidates.starts[i], state]))[-1]
         for i, state in zip(candidates.trajectory, candidates.states, strict=True)
     ]
     np.testing.assert_allclose(scores, [expected], atol=1e-6)
@@ -78,18 +80,18 @@ def test_scores_are_the_scorer_s_and_find_the_open_door(candidates: Candidates) 
 
 def test_repeats_draw_other_goals(candidates: Candidates) -> None:
     config = replace(CONFIG, goal="drawings")
-    rows = score_as_goals(candidates, config, n_repeats=3, n_goals=1, n_workers=1)
+    rows = score_as_goals(candidates, config, VIEWS, n_repeats=3, n_goals=1, n_workers=1)
     assert rows.shape == (3, 40)
     assert len({row.tobytes() for row in rows}) > 1
     with pytest.raises(BadInput, match=r"pictures, 99 cannot be drawn of them"):
-        score_as_goals(candidates, config, n_goals=99, n_workers=1)
+        score_as_goals(candidates, config, VIEWS, n_goals=99, n_workers=1)
 
 
 def test_an_action_is_seen_from_the_views_of_the_trajectory_s_own_task(candidates: Candidates) -> None:
-    of_another_goal = replace(CONFIG, views=replace(CONFIG.views, task="sdoor"))
-    scores = score_as_actions(candidates, of_another_goal, n_workers=1)
-    goal = Scorer.build(of_another_goal, candidates.starts[0], n_workers=1)
-    seen = Scorer(CONFIG, goal.starts, goal.goals, "", n_workers=1)
+    of_another_task = replace(VIEWS, task="sdoor")
+    scores = score_as_actions(candidates, CONFIG, of_another_task, n_workers=1)
+    goal = StateScorer.build(CONFIG, of_another_task, candidates.starts[0], n_workers=1).scorer
+    seen = StateScorer.of(replace(goal, views=VIEWS), n_workers=1)
     expected = seen.score_pairs(candidates.contexts("same", 0), candidates.states)
     np.testing.assert_allclose(scores, [expected], atol=1e-6)
     assert np.ptp(scores) > 0
@@ -113,13 +115,13 @@ def test_x_0_of_another_trajectory_matters_where_starts_differ(
 ) -> None:
     from zest_rl import cli
 
-    assert candidates.start_alike(CONFIG.views), "the robot is hidden"
-    assert not candidates.start_alike(replace(CONFIG.views, robot=True, tolerance=1e-3))
+    assert candidates.start_alike(VIEWS), "the robot is hidden"
+    assert not candidates.start_alike(replace(VIEWS, robot=True, tolerance=1e-3))
     ajar = candidates.starts.copy()
     ajar[1:, 22] = [-0.1, -0.2, -0.3]  # the microwave
     for starts, equal in ((candidates.starts, True), (ajar, False)):
         pool = replace(candidates, starts=starts)
-        same, other = (score_as_goals(pool, CONFIG, context=c, n_workers=1) for c in ("same", "different"))
+        same, other = (score_as_goals(pool, CONFIG, VIEWS, context=c, n_workers=1) for c in ("same", "different"))
         assert np.allclose(same, other) == equal
     words = ("--views", "1", "--tolerance", "0.05", "--n-frames", "60", "--top", "5", "--n-workers", "1")
     assert cli.main(["select", "goals", COLLECTED, "--context", "different", "--n-repeats", "1", *words]) == 0

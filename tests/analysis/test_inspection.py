@@ -20,20 +20,21 @@ from zest_rl.errors import BadInput
 from zest_rl.metrics import reward_quality, statistics
 from zest_rl.metrics.statistics import Estimate
 from zest_rl.report import render_html
-from zest_rl.rewards.relabel import relabel
+from zest_rl.rewards.relabel import relabel_source
 from zest_rl.rewards.scorer import ScorerConfig
 from zest_rl.simulation import rendering
 from zest_rl.simulation.views import Views
+from zest_rl.sources.kitchen import kitchen_source
 
 VIEWS = Views("micro", n_views=1, size=96, tolerance=0.05)
-CONFIG = ScorerConfig(VIEWS, "same-scene")
+CONFIG = ScorerConfig("same-scene")
 NEEDS_TRUTH = {figure.name for figure in FIGURES if figure.needs == "truth"}
 
 
 @pytest.fixture
 def scored(collected: str) -> str:
     """The tiny dataset with same-scene scores."""
-    return relabel(collected, CONFIG, n_workers=1).dataset_id
+    return relabel_source(kitchen_source(collected, VIEWS), CONFIG, n_workers=1).dataset_id
 
 
 def episodes_file(dataset_id: str) -> Path:
@@ -58,7 +59,7 @@ def test_figures_are_those_of_the_recorded_scores_and_ground_truth(scored: str) 
 
 
 def test_scores_of_other_episodes_are_found_out_without_ground_truth(collected: str) -> None:
-    shuffled = relabel(collected, CONFIG, shuffle=0, n_workers=1).dataset_id
+    shuffled = relabel_source(kitchen_source(collected, VIEWS), CONFIG, shuffle=0, n_workers=1).dataset_id
     found = inspect(shuffled)
     assert found.figures["Contradictory"].value > 0.01
     told, seen = (warning for warning in found.warnings if "shuffle" in warning)
@@ -128,7 +129,7 @@ def test_constant_scores_and_constant_returns_are_warned_of() -> None:
 
 
 def test_differences_are_judged_as_the_trainer_sees_them(collected: str, scored: str) -> None:
-    differences = relabel(collected, CONFIG, reward="difference", n_workers=1).dataset_id
+    differences = relabel_source(kitchen_source(collected, VIEWS), CONFIG, reward="difference", n_workers=1).dataset_id
     found, level = inspect(differences), inspect(scored)
     last = np.array([score[-1] - score[0] for score in reader.read_scores(differences)])
     truth = np.array([episode.episode_return for episode in reader.read_ground_truth(differences)])
@@ -243,7 +244,7 @@ def test_the_page_shows_tasks_against_goals_and_does_without_where_scorers_are_o
 def test_the_verb_prints_figures_warns_and_leaves_a_page(
     collected: str, scored: str, tmp_path: Path, zest: Callable[..., dict[str, Any]]
 ) -> None:
-    shuffled = relabel(collected, CONFIG, shuffle=0, n_workers=1).dataset_id
+    shuffled = relabel_source(kitchen_source(collected, VIEWS), CONFIG, shuffle=0, n_workers=1).dataset_id
     result = zest("inspect", scored, shuffled, "--output", tmp_path / "page.html")
     assert set(result["datasets"]) == {scored, shuffled}
     figure = result["datasets"][scored]["figures"]["Value-order correlation"]

@@ -34,15 +34,15 @@ from zest_rl.evaluation.evaluate import (
 from zest_rl.kitchen.collect import env_spec
 from zest_rl.kitchen.env import ENV_ID, HORIZON, KitchenEnv
 from zest_rl.rewards.relabel import SCORER_FILE
-from zest_rl.rewards.scorer import Scorer
+from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 
 ONLINE = EvaluationConfig(n_episodes=2, seed=11)
 CONSTANT = replace(ONLINE, rtg="constant")
 
 
-def load_scorer(run: Path) -> Scorer:
-    return Scorer.load(run / SCORER_FILE, n_workers=1)
+def load_scorer(run: Path) -> StateScorer:
+    return StateScorer.load(run / SCORER_FILE, n_workers=1)
 
 
 class Replay:
@@ -76,7 +76,7 @@ def replay(trained: Path) -> Callable[..., tuple[Replay, Arrays]]:
     seed = int(np.random.SeedSequence([0, 0]).generate_state(2)[0])  # as `zest_rl.kitchen.collect.rollout` draws it
     actions = reader.read_episodes(COLLECTED)[0].actions
 
-    def play(name: str, config: EvaluationConfig = ONLINE, scorer: Scorer | None = None) -> tuple[Replay, Arrays]:
+    def play(name: str, config: EvaluationConfig = ONLINE, scorer: StateScorer | None = None) -> tuple[Replay, Arrays]:
         policy = Replay(trained / name, actions)
         return policy, rollout(policy, env_spec("micro").to_json(), range(seed, seed + 1), config, scorer)
 
@@ -192,7 +192,7 @@ def test_the_ground_truth_never_reaches_a_policy_of_the_scores(
 ) -> None:
     scorer = load_scorer(trained / "dt-0")
 
-    def decisions(name: str, scorer: Scorer | None = None) -> np.ndarray:
+    def decisions(name: str, scorer: StateScorer | None = None) -> np.ndarray:
         return np.stack(replay(name, scorer=scorer)[0].decided)
 
     of_scores, of_truth = decisions("dt-0", scorer), decisions("gt-0")

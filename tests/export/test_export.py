@@ -26,9 +26,10 @@ from zest_rl.errors import BadInput, ZestError
 from zest_rl.export import export, transitions
 from zest_rl.export.lerobot import DATA_FILE
 from zest_rl.export.transitions import shape_rewards
-from zest_rl.rewards.relabel import relabel
+from zest_rl.rewards.relabel import relabel_source
 from zest_rl.rewards.scorer import ScorerConfig
 from zest_rl.simulation.views import Views
+from zest_rl.sources.kitchen import kitchen_source
 
 SIDE = 16
 ROOM = {
@@ -73,6 +74,9 @@ def write_minari(
     return dataset_id
 
 
+VIEWS = Views("micro", n_views=1, size=96, tolerance=0.05)
+
+
 @pytest.fixture
 def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A Minari root and a cache of this test's own."""
@@ -94,7 +98,7 @@ def goal(tmp_path: Path) -> Path:
 @pytest.fixture
 def scored(collected: str) -> str:
     """The tiny dataset with same-scene scores."""
-    return relabel(collected, ScorerConfig(Views("micro", n_views=1, size=96, tolerance=0.05), "same-scene")).dataset_id
+    return relabel_source(kitchen_source(collected, VIEWS), ScorerConfig("same-scene")).dataset_id
 
 
 def corl(arrays: Any) -> dict[str, np.ndarray]:
@@ -274,9 +278,9 @@ def test_rewards_take_the_shape_that_is_asked_for() -> None:
 
 
 def test_differences_are_those_of_relabeling(scored: str, collected: str) -> None:
-    config = ScorerConfig(Views("micro", n_views=1, size=96, tolerance=0.05), "same-scene", features="raw")
-    level = relabel(collected, config).dataset_id
-    difference = relabel(collected, config, reward="difference").dataset_id
+    config = ScorerConfig("same-scene", features="raw")
+    level = relabel_source(kitchen_source(collected, VIEWS), config).dataset_id
+    difference = relabel_source(kitchen_source(collected, VIEWS), config, reward="difference").dataset_id
     for one, other in zip(transitions(level, shape="difference"), transitions(difference), strict=True):
         np.testing.assert_allclose(one["rewards"], other["rewards"], atol=1e-6)
     with pytest.raises(BadInput, match="are differences already"):

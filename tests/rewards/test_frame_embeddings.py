@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from zest_rl.rewards.frame_embeddings import FrameScorer, FrameScorerConfig
+from zest_rl.rewards.frame_embeddings import FrameEmbeddings
+from zest_rl.rewards.state_embeddings import EmbedConfig, StateEmbedder, StateEmbeddings
+from zest_rl.simulation.views import Views
 from zest_rl.sources import Source, open_source
+from zest_rl.sources.kitchen import KitchenStates, kitchen_source
 from zest_rl.sources.videos import Clips
 from zest_rl.types import Frame
 
@@ -61,8 +64,22 @@ def picture(rng: np.random.Generator) -> np.ndarray:
 def test_the_paths_of_all_episodes_are_not_sent_with_each_job(source: Source, tmp_path: Path) -> None:
     assert isinstance(source.frames, Clips)
     counted = CountedClips(source.frames.paths, tmp_path / "cache", [0])
-    digests = [counted.digest(episode) for episode in range(N_EPISODES)]
-    scorer = FrameScorer(FrameScorerConfig(str(tmp_path / "goal")), device="cpu", n_workers=2)
-    scorer.embed(Source(source.trajectories, counted), digests)
+    embeddings = FrameEmbeddings(Source(source.trajectories, counted), "efficientnet-lite0", device="cpu", n_workers=2)
+    embeddings.embed()
     assert counted.n_sent == [2], "once to each worker"
-    assert [frames.shape for frames in scorer.embedded(source, digests)] == [(2, 1, 1280)] * N_EPISODES
+    assert [episode.embeddings.shape for episode in embeddings] == [(2, 1, 1280)] * N_EPISODES
+
+
+def test_the_kitchen_embedded_by_distinct_states_is_the_kitchen_embedded_frame_by_frame(collected: str) -> None:
+    source = kitchen_source(collected, Views("micro", n_views=2, size=96, tolerance=0.05))
+    frames = source.frames
+    assert isinstance(frames, KitchenStates)
+    by_state = StateEmbeddings(
+        StateEmbedder(EmbedConfig(frames.ring, "efficientnet-lite0"), n_workers=1), frames.states
+    )
+    by_frame = FrameEmbeddings(source, "efficientnet-lite0", n_workers=1)
+    for embeddings in (by_state, by_frame):
+        embeddings.embed()
+    assert by_state.n_embedded < sum(map(len, frames.states)) / 2, "equal states are embedded once"
+    for one, other in zip(by_state, by_frame, strict=True):
+        np.testing.assert_allclose(one.embeddings[one.index], other.embeddings[other.index], atol=1e-4)

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +25,25 @@ from zest_rl.rewards.relabel import (
     GOAL_FOLDER,
     SCORER_FILE,
     Relabeled,
-    relabel,
+    relabel_source,
     relabeled_id,
     rewards_from_scores,
     shuffled,
 )
-from zest_rl.rewards.scorer import Scorer, ScorerConfig
+from zest_rl.rewards.scorer import ScorerConfig
 from zest_rl.rewards.state_embeddings import STATES_PER_SHARD
+from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.simulation.views import Views
+from zest_rl.sources.kitchen import kitchen_source
 
-CONFIG = ScorerConfig(Views("micro", n_views=1, size=96, tolerance=0.05), "same-scene")
+VIEWS = Views("micro", n_views=1, size=96, tolerance=0.05)
+CONFIG = ScorerConfig("same-scene")
 DRAWINGS = Path(__file__).parents[2] / "datasets" / "goals" / "micro"
 SOURCE = "zest/kitchen-micro-tiny-v0"
+
+
+def relabel_kitchen(config: ScorerConfig, **options: Any) -> Relabeled:
+    return relabel_source(kitchen_source(SOURCE, VIEWS), config, **options)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +59,7 @@ def places(collected_root: Path, tmp_path_factory: pytest.TempPathFactory) -> An
 
 @pytest.fixture(scope="module")
 def relabeled(places: Path) -> Relabeled:
-    return relabel(SOURCE, CONFIG, n_workers=1)
+    return relabel_kitchen(CONFIG, n_workers=1)
 
 
 def arrays(dataset_id: str) -> dict[str, np.ndarray]:
@@ -144,17 +151,17 @@ def test_the_metadata_tells_how_the_rewards_were_made(relabeled: Relabeled) -> N
     assert facts["source"] == SOURCE
     assert facts["source_sha256"] == reader.fingerprint(SOURCE)
     assert facts["reward"] == "level"
-    assert ScorerConfig.from_dict(facts["scorer"]["config"]) == CONFIG
+    assert facts["scorer"]["config"] == {"views": asdict(VIEWS), **asdict(CONFIG)}
     assert facts["scorer"] == json.loads(json.dumps(relabeled.scorer.describe()))
     assert facts["n_still_frames"] == relabeled.n_still > 100
     assert {"torch", "mujoco", "timm", "zest-rl"} <= set(facts["provenance"]["versions"])
 
 
 def test_the_scorer_beside_the_data_scores_them_as_they_were_scored(relabeled: Relabeled) -> None:
-    scorer = Scorer.load(relabeled.path / SCORER_FILE, n_workers=1)
-    scores, _ = scorer.score_episodes(reader.read_states(SOURCE))
-    for again, written in zip(scores, reader.read_scores(relabeled.dataset_id), strict=True):
-        np.testing.assert_array_equal(again, written)
+    scorer = StateScorer.load(relabeled.path / SCORER_FILE, n_workers=1)
+    written = reader.read_scores(relabeled.dataset_id)
+    for states, scores in zip(reader.read_states(SOURCE), written, strict=True):
+        np.testing.assert_array_equal(scorer.score_episode(states), scores)
 
 
 def test_small_pictures_of_the_goal_lie_beside_the_data(relabeled: Relabeled) -> None:
@@ -177,35 +184,35 @@ def test_the_name_says_where_the_dataset_comes_from_and_is_a_hash_of_how_it_was_
         (replace(CONFIG, similarity="l2"), "level"),
         (replace(CONFIG, goal=str(places / "my goals")), "level"),
     ]
-    others = [relabel(SOURCE, config, reward=reward, n_workers=1) for config, reward in variants]
+    others = [relabel_kitchen(config, reward=reward, n_workers=1) for config, reward in variants]
     names = {relabeled.dataset_id, *(other.dataset_id for other in others)}
     assert len(names) == 5
     assert all(reader.DATASET_ID.fullmatch(name) and name.startswith("zest/kitchen-micro-tiny-zest-") for name in names)
-    assert sum(other.scorer.states.n_embedded for other in others) == 0, "the states were embedded already"
+    assert sum(other.n_embedded for other in others) == 0, "the states were embedded already"
     for scores, episode in zip(
         reader.read_scores(relabeled.dataset_id), reader.read_episodes(others[0].dataset_id), strict=True
     ):
         np.testing.assert_array_equal(episode.rewards, np.diff(scores))
 
-    renamed = relabel(SOURCE, replace(CONFIG, goal=str(places / "same pictures, other name")), n_workers=1)
+    renamed = relabel_kitchen(replace(CONFIG, goal=str(places / "same pictures, other name")), n_workers=1)
     assert renamed.dataset_id == others[-1].dataset_id
     assert renamed.already_there
 
 
 def test_a_null_control_and_a_choice_of_goals_are_datasets_of_their_own(relabeled: Relabeled, places: Path) -> None:
-    null = relabel(SOURCE, CONFIG, shuffle=3, n_workers=1)
+    null = relabel_kitchen(CONFIG, shuffle=3, n_workers=1)
     rewards, nulls = (
         [e.rewards for e in reader.read_episodes(name)] for name in (relabeled.dataset_id, null.dataset_id)
     )
     assert sorted(map(bytes, nulls)) == sorted(map(bytes, rewards))
     assert not any(np.array_equal(reward, own) for reward, own in zip(nulls, rewards, strict=True))
     assert reader.read_metadata(null.dataset_id)["zest"]["relabel"]["shuffle"] == 3
-    chosen = relabel(SOURCE, replace(CONFIG, goal=str(DRAWINGS), goal_share=0.4), n_workers=1)
+    chosen = relabel_kitchen(replace(CONFIG, goal=str(DRAWINGS), goal_share=0.4), n_workers=1)
     kept = reader.read_metadata(chosen.dataset_id)["zest"]["relabel"]["kept_goals"]
     assert len(kept) == 1
     assert len(list((chosen.path / GOAL_FOLDER / "goal").iterdir())) == 1
     assert len({relabeled.dataset_id, null.dataset_id, chosen.dataset_id}) == 3
-    again = relabel(SOURCE, replace(CONFIG, goal=str(DRAWINGS), goal_share=0.4), n_workers=1)
+    again = relabel_kitchen(replace(CONFIG, goal=str(DRAWINGS), goal_share=0.4), n_workers=1)
     assert again.already_there
     np.testing.assert_array_equal(again.scorer.goals, chosen.scorer.goals)
 
@@ -215,10 +222,10 @@ def test_relabeling_again_does_nothing(relabeled: Relabeled) -> None:
         return {path: path.stat().st_mtime_ns for path in relabeled.path.parent.rglob("*")}
 
     before = times()
-    again = relabel(SOURCE, CONFIG, n_workers=1)
+    again = relabel_kitchen(CONFIG, n_workers=1)
     assert again.already_there
     assert (again.dataset_id, again.path, again.n_frames) == (relabeled.dataset_id, relabeled.path, 404)
-    assert again.scorer.states.n_embedded == 0
+    assert again.n_embedded == 0
     assert times() == before
 
 
@@ -241,7 +248,7 @@ def test_of_two_equal_calls_at_once_the_second_finds_the_work_done(collected: st
 
 ZEST = "import sys; from zest_rl.cli import main; sys.exit(main())"
 DIE_WHILE_WRITING = (
-    f"import os, zest_rl.rewards.relabel as r; r._leave_scorer = lambda *_: os.kill(os.getpid(), 9); {ZEST}"
+    f"import os; from zest_rl.rewards import relabel as r; r._leave_scorer = lambda *_: os.kill(os.getpid(), 9); {ZEST}"
 )
 
 
@@ -315,7 +322,7 @@ def test_nothing_flows_from_the_ground_truth_into_rewards_or_policies(
         monkeypatch.setenv("ZEST_CACHE", str(tmp_path / f"{name} cache"))
         prepare(SOURCE)
         truth = [gt.rewards for gt in reader.read_ground_truth(SOURCE)]
-        made = relabel(SOURCE, CONFIG, n_workers=1).dataset_id
+        made = relabel_kitchen(CONFIG, n_workers=1).dataset_id
         for agent in ("bc", "dt"):
             small = ["--n-updates", "10", "--hidden-size", "16", "--n-layers", "1", "--batch-size", "8"]
             run = ["--run-dir", str(tmp_path / f"{name} {agent}"), "--threads", "1", "--device", "cpu"]

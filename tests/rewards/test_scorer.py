@@ -16,13 +16,14 @@ from zest_rl.embedders import load_embedder
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen.env import KitchenEnv
 from zest_rl.kitchen.tasks import TASKS
-from zest_rl.rewards import state_embeddings
+from zest_rl.rewards.embeddings import shared_embedder
 from zest_rl.rewards.scorer import Scorer, ScorerConfig
 from zest_rl.rewards.scores import score_views
+from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.simulation.views import Views
 
 VIEWS = Views("micro", n_views=2, size=96, tolerance=0.05)
-CONFIG = ScorerConfig(VIEWS, "same-scene")
+CONFIG = ScorerConfig("same-scene")
 DRAWINGS = Path(__file__).parents[2] / "datasets" / "goals" / "micro"
 MICROWAVE = 22
 """Place of the microwave's joint in qpos."""
@@ -44,8 +45,8 @@ def episodes(collected_root: Path) -> list[np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def scorer(episodes: list[np.ndarray]) -> Scorer:
-    return Scorer.build(CONFIG, episodes[0][0], n_workers=1)
+def scorer(episodes: list[np.ndarray]) -> StateScorer:
+    return StateScorer.build(CONFIG, VIEWS, episodes[0][0], n_workers=1)
 
 
 @pytest.fixture(scope="module")
@@ -65,39 +66,43 @@ def opening(n: int) -> np.ndarray:
     return states
 
 
-def build(states: np.ndarray, **changes: Any) -> Scorer:
-    return Scorer.build(replace(CONFIG, **changes), states[0], n_workers=1)
+def build(states: np.ndarray, views: Views = VIEWS, **changes: Any) -> StateScorer:
+    return StateScorer.build(replace(CONFIG, **changes), views, states[0], n_workers=1)
+
+
+def score_all(scorer: StateScorer, episodes: list[np.ndarray]) -> tuple[list[np.ndarray], int]:
+    return scorer.scorer.score_episodes(scorer.embeddings(episodes))
 
 
 # --- what the scores are ---
 
 
 def test_scores_are_those_of_each_frames_embeddings_and_still_frames_are_counted(
-    scorer: Scorer, episodes: list[np.ndarray]
+    scorer: StateScorer, episodes: list[np.ndarray]
 ) -> None:
-    scores, n_still = scorer.score_episodes(episodes)
+    scores, n_still = score_all(scorer, episodes)
     assert [score.shape for score in scores] == [(101,)] * len(episodes)
     for score, states in zip(scores, episodes, strict=True):
-        embeddings = scorer.states.embed_now(states)
+        embeddings = scorer.embedder.embed_now(states)
         assert score.dtype == np.float32
         assert score[0] == 0
-        np.testing.assert_allclose(score, score_views(embeddings, scorer.starts, scorer.goals), atol=1e-6)
+        np.testing.assert_allclose(score, score_views(embeddings, scorer.scorer.starts, scorer.scorer.goals), atol=1e-6)
     zero = sum(int((score[1:] == 0).sum()) for score in scores)
     assert n_still == zero > 100, "the failed episode alone rests for its 100 steps"
 
 
 def test_a_goal_in_the_same_scene_has_one_pair_per_view_and_its_score_rises_as_the_microwave_opens() -> None:
     scorer = build(opening(1), views=replace(VIEWS, tolerance=1e-3))
-    assert scorer.starts.shape == scorer.goals.shape == (2, 1, 1280)
-    (scores,), _ = scorer.score_episodes([opening(9)])
+    assert scorer.scorer.starts.shape == scorer.scorer.goals.shape == (2, 1, 1280)
+    (scores,), _ = score_all(scorer, [opening(9)])
     assert scores[0] == 0
     assert (np.diff(scores) > 0).all()
     assert scores[-1] > 0.99
 
 
-def test_each_episode_is_measured_from_its_own_first_frame(scorer: Scorer) -> None:
+def test_each_episode_is_measured_from_its_own_first_frame(scorer: StateScorer) -> None:
     states = opening(5)
-    (closed_first, open_first), _ = scorer.score_episodes([states, states[::-1]])
+    (closed_first, open_first), _ = score_all(scorer, [states, states[::-1]])
     assert closed_first[-1] > 0.9
     assert open_first[-1] < -0.9
 
@@ -107,7 +112,7 @@ def test_scoring_states_as_they_come_gives_the_scores_of_whole_episodes(
     episodes: list[np.ndarray], features: Any, similarity: Any
 ) -> None:
     scorer = build(episodes[0], features=features, similarity=similarity)
-    expected, _ = scorer.score_episodes(episodes)
+    expected, _ = score_all(scorer, episodes)
     first = np.stack([states[0] for states in episodes])
     for step in (0, 40, 100):
         online = scorer.score_now(first, np.stack([states[step] for states in episodes]))
@@ -115,7 +120,7 @@ def test_scoring_states_as_they_come_gives_the_scores_of_whole_episodes(
         np.testing.assert_allclose(online, [score[step] for score in expected], atol=1e-6)
 
 
-def test_episodes_that_start_differently_are_scored_together_as_they_are_alone(scorer: Scorer) -> None:
+def test_episodes_that_start_differently_are_scored_together_as_they_are_alone(scorer: StateScorer) -> None:
     states = opening(4)
     first, current = states[[0, 2, 0, 3]], states[[1, 1, 3, 0]]
     together = scorer.score_now(first, current)
@@ -127,18 +132,18 @@ def test_episodes_that_start_differently_are_scored_together_as_they_are_alone(s
 
 def test_pictures_of_elsewhere_are_shared_by_all_views(episodes: list[np.ndarray]) -> None:
     scorer = build(episodes[0], goal="drawings")
-    assert scorer.starts.shape == scorer.goals.shape == (3, 1280)
-    (scores,), _ = scorer.score_episodes([episodes[0]])
+    assert scorer.scorer.starts.shape == scorer.scorer.goals.shape == (3, 1280)
+    (scores,), _ = score_all(scorer, [episodes[0]])
     assert np.ptp(scores) > 0
 
 
 def test_sentences_score_frames_with_a_network_that_reads_them(clip_file: Path) -> None:
     uri = f"open_clip:ViT-S-32-alt@{clip_file}"
     scorer = build(opening(1), goal="text:closed microwave | shut oven -> open microwave", embedder=uri)
-    assert (scorer.starts.shape, scorer.goals.shape) == ((2, 256), (1, 256))
+    assert (scorer.scorer.starts.shape, scorer.scorer.goals.shape) == ((2, 256), (1, 256))
     texts = load_embedder(uri).embed_texts(["open microwave"])
-    np.testing.assert_allclose(scorer.goals, texts, atol=1e-3)
-    (scores,), _ = scorer.score_episodes([opening(3)])
+    np.testing.assert_allclose(scorer.scorer.goals, texts, atol=1e-3)
+    (scores,), _ = score_all(scorer, [opening(3)])
     assert scores[0] == 0
     assert (scores[1:] != 0).all()
 
@@ -150,13 +155,13 @@ def test_sentences_for_a_network_of_pictures_are_refused_and_one_that_reads_them
 
 def test_a_goal_is_embedded_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("ZEST_CACHE", str(tmp_path))
-    first = build(opening(1), goal="drawings")
+    first = build(opening(1), goal="drawings").scorer
     (path,) = (tmp_path / "goals").glob("*.npz")
     written = path.stat().st_mtime_ns
-    np.testing.assert_array_equal(build(opening(1), goal="drawings").goals, first.goals)
+    np.testing.assert_array_equal(build(opening(1), goal="drawings").scorer.goals, first.goals)
     assert path.stat().st_mtime_ns == written
     path.write_bytes(path.read_bytes()[:1000])
-    np.testing.assert_array_equal(build(opening(1), goal="drawings").goals, first.goals)
+    np.testing.assert_array_equal(build(opening(1), goal="drawings").scorer.goals, first.goals)
 
 
 def test_the_fingerprint_names_all_that_a_score_depends_on() -> None:
@@ -169,25 +174,25 @@ def test_the_fingerprint_names_all_that_a_score_depends_on() -> None:
         build(start, goal="drawings", precision="bf16"),
         build(start, goal="drawings", views=replace(VIEWS, tolerance=0.1)),
     ]
-    assert len({scorer.fingerprint() for scorer in scorers}) == len(scorers)
-    assert build(start).fingerprint() == scorers[0].fingerprint()
+    assert len({scorer.scorer.fingerprint() for scorer in scorers}) == len(scorers)
+    assert build(start).scorer.fingerprint() == scorers[0].scorer.fingerprint()
 
 
 # --- on disk ---
 
 
 def test_a_saved_scorer_gives_the_same_bits_and_needs_no_goal(
-    scorer: Scorer, episodes: list[np.ndarray], tmp_path: Path
+    scorer: StateScorer, episodes: list[np.ndarray], tmp_path: Path
 ) -> None:
-    scorer.save(tmp_path / "scorer.safetensors")
-    loaded = Scorer.load(tmp_path / "scorer.safetensors", n_workers=1)
-    assert loaded.config == CONFIG
-    assert loaded.goal is None
-    assert loaded.describe() == scorer.describe()
-    assert loaded.fingerprint() == scorer.fingerprint()
-    for ours, theirs in zip(loaded.score_episodes(episodes)[0], scorer.score_episodes(episodes)[0], strict=True):
+    scorer.scorer.save(tmp_path / "scorer.safetensors")
+    loaded = StateScorer.load(tmp_path / "scorer.safetensors", n_workers=1)
+    assert (loaded.scorer.config, loaded.scorer.views) == (CONFIG, VIEWS)
+    assert loaded.scorer.goal is None
+    assert loaded.scorer.describe() == scorer.scorer.describe()
+    assert loaded.scorer.fingerprint() == scorer.scorer.fingerprint()
+    for ours, theirs in zip(score_all(loaded, episodes)[0], score_all(scorer, episodes)[0], strict=True):
         np.testing.assert_array_equal(ours, theirs)
-    loaded.save(tmp_path / "again.safetensors")
+    loaded.scorer.save(tmp_path / "again.safetensors")
     assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "scorer.safetensors").read_bytes()
 
 
@@ -199,10 +204,10 @@ def test_a_scorer_of_other_weights_is_refused(tmp_path: Path) -> None:
     def write(seed: int) -> None:
         torch.manual_seed(seed)
         torch.save(timm.create_model("resnet10t", pretrained=False).state_dict(), weights)
-        state_embeddings.shared_embedder.cache_clear()  # as in a later process
+        shared_embedder.cache_clear()  # as in a later process
 
     write(0)
-    build(opening(1), embedder=f"timm:resnet10t@{weights}").save(tmp_path / "scorer.safetensors")
+    build(opening(1), embedder=f"timm:resnet10t@{weights}").scorer.save(tmp_path / "scorer.safetensors")
     write(1)
     with pytest.raises(ZestError, match=r"was made with another embedder \(weights, precision, or versions differ\)"):
         Scorer.load(tmp_path / "scorer.safetensors")
@@ -219,32 +224,32 @@ def rewrite(path: Path, **changes: Any) -> None:
     safetensors.numpy.save_file(arrays, path, metadata={"scorer": json.dumps(described)})
 
 
-def test_a_scorer_of_another_precision_or_other_views_is_refused(scorer: Scorer, tmp_path: Path) -> None:
+def test_a_scorer_of_another_precision_or_other_views_is_refused(scorer: StateScorer, tmp_path: Path) -> None:
     path = tmp_path / "scorer.safetensors"
-    scorer.save(path)
+    scorer.scorer.save(path)
     rewrite(path, precision="bf16")
     with pytest.raises(ZestError, match="made with another embedder") as caught:
         Scorer.load(path)
     assert not isinstance(caught.value, BadInput)
-    scorer.save(path)
-    rewrite(path, views={**scorer.describe()["config"]["views"], "size": 64})
+    scorer.scorer.save(path)
+    rewrite(path, views={**scorer.scorer.describe()["config"]["views"], "size": 64})
     with pytest.raises(ZestError, match="made with another views"):
         Scorer.load(path)
 
 
-def test_a_missing_or_damaged_scorer_is_an_error_that_says_what_to_do(scorer: Scorer, tmp_path: Path) -> None:
+def test_a_missing_or_damaged_scorer_is_an_error_that_says_what_to_do(scorer: StateScorer, tmp_path: Path) -> None:
     path = tmp_path / "scorer.safetensors"
     expected = r"scorer.safetensors cannot be read .*relabel the dataset again"
     with pytest.raises(ZestError, match=expected):
         Scorer.load(path)
-    scorer.save(path)
+    scorer.scorer.save(path)
     whole = path.read_bytes()
     for damaged in (b"", whole[:-1], whole[:40], b"\0" * len(whole), whole.replace(b'{\\"config', b"??????????")):
         assert damaged != whole
         path.write_bytes(damaged)
         with pytest.raises(ZestError, match=expected):
             Scorer.load(path)
-    scorer.save(path)
+    scorer.scorer.save(path)
     rewrite(path, colour="blue")
     with pytest.raises(ZestError, match=expected):
         Scorer.load(path)
@@ -254,30 +259,28 @@ def test_a_missing_or_damaged_scorer_is_an_error_that_says_what_to_do(scorer: Sc
 
 
 def test_the_goals_that_the_episodes_end_nearest_to_are_kept(episodes: list[np.ndarray], tmp_path: Path) -> None:
-    config = replace(CONFIG, goal=str(DRAWINGS), goal_share=0.5)
-    scorer = Scorer.build(config, episodes[0][0], n_workers=1)
-    whole = Scorer.build(replace(config, goal_share=1.0), episodes[0][0], n_workers=1)
-    n_goals = len(whole.goals)
+    whole = build(episodes[0], goal=str(DRAWINGS), goal_share=0.5)
+    n_goals = len(whole.scorer.goals)
     at_end = []
     for k in range(n_goals):
-        alone = Scorer(config, whole.starts, whole.goals[[k]], "", n_workers=1)
-        at_end.append(np.mean([score[-1] for score in alone.score_episodes(episodes)[0]]))
-    kept = scorer.select_goals(episodes)
+        alone = whole.with_goals(np.array([k]))
+        at_end.append(np.mean([score[-1] for score in score_all(alone, episodes)[0]]))
+    kept = whole.scorer.goals_near(whole.embeddings(episodes))
+    scorer = whole.with_goals(kept)
     assert sorted(kept) == sorted(np.argsort(at_end)[-len(kept) :])
     assert len(kept) == round(n_goals / 2)
-    np.testing.assert_array_equal(scorer.goals, whole.goals[kept])
-    assert scorer.goal is not None
-    assert len(scorer.goal.goals) == len(kept)
-    scorer.save(tmp_path / "scorer.safetensors")
-    loaded = Scorer.load(tmp_path / "scorer.safetensors", n_workers=1)
-    for one, other in zip(scorer.score_episodes(episodes)[0], loaded.score_episodes(episodes)[0], strict=True):
+    np.testing.assert_array_equal(scorer.scorer.goals, whole.scorer.goals[kept])
+    assert scorer.scorer.goal is not None
+    assert len(scorer.scorer.goal.goals) == len(kept)
+    scorer.scorer.save(tmp_path / "scorer.safetensors")
+    loaded = StateScorer.load(tmp_path / "scorer.safetensors", n_workers=1)
+    for one, other in zip(score_all(scorer, episodes)[0], score_all(loaded, episodes)[0], strict=True):
         np.testing.assert_array_equal(one, other)
-    assert scorer.fingerprint() != whole.fingerprint()
+    assert scorer.scorer.fingerprint() != build(episodes[0], goal=str(DRAWINGS)).scorer.fingerprint()
 
 
 def test_one_goal_is_always_kept_and_a_share_of_none_is_refused(episodes: list[np.ndarray]) -> None:
-    scorer = Scorer.build(replace(CONFIG, goal_share=0.01), episodes[0][0], n_workers=1)
-    assert list(scorer.select_goals(episodes)) == [0]
-    assert scorer.goals.shape[-2] == 1
+    scorer = build(episodes[0], goal_share=0.01)
+    assert list(scorer.scorer.goals_near(scorer.embeddings(episodes))) == [0]
     with pytest.raises(BadInput, match=r"goal_share must be in \(0, 1\], got 0"):
         replace(CONFIG, goal_share=0.0)

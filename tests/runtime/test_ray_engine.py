@@ -12,7 +12,7 @@ import pytest
 
 from zest_rl.data import reader
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.rewards.state_embeddings import check_same_embedder, shared_embedder
+from zest_rl.rewards.embeddings import check_same_embedder, shared_embedder
 from zest_rl.runtime import ray_engine
 from zest_rl.runtime.arrays import Arrays, read_arrays
 from zest_rl.runtime.parallel import cached_jobs

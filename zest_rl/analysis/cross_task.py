@@ -24,7 +24,7 @@ from zest_rl.report import (
 )
 from zest_rl.report.panels import MIN_EPISODES_TO_RANK, goal_panel
 from zest_rl.rewards.relabel import SCORER_FILE
-from zest_rl.rewards.scorer import Scorer
+from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.types import FloatArray
 
 
@@ -105,7 +105,7 @@ def confusion(
     ends = [np.stack([e[[0, -1]] for e in reader.read_states(one.dataset_id)], axis=1) for one in seen.values()]
     found = np.empty((3, len(seen), len(inspections)), dtype=np.float32)
     for column, goal_of in enumerate(inspections):
-        goal = Scorer.load(reader.dataset_path(goal_of.dataset_id) / SCORER_FILE, n_workers=n_workers)
+        goal = StateScorer.load(reader.dataset_path(goal_of.dataset_id) / SCORER_FILE, n_workers=n_workers)
         for row, ((first, last), shown) in enumerate(zip(ends, seen.values(), strict=True)):
             scores = goal.seen_as(shown.task).score_pairs(first, last).astype(np.float64)
             mean = bootstrap([scores], n_resamples=1000)
@@ -154,7 +154,7 @@ def look_at(inspection: Inspection, *, n_workers: int | None = None) -> dict[str
     """
     if inspection.made["shuffle"] is not None or "frames" in inspection.made:
         return {}
-    scorer = Scorer.load(reader.dataset_path(inspection.dataset_id) / SCORER_FILE, n_workers=n_workers)
+    scorer = StateScorer.load(reader.dataset_path(inspection.dataset_id) / SCORER_FILE, n_workers=n_workers)
     states = reader.read_states(inspection.dataset_id)
     return {
         "best": Look(scorer, states[int(np.argmax(inspection.returns))]),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.data.video import evenly_spaced
-from zest_rl.rewards.scorer import Scorer
+from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.simulation.views import canonical_states
 from zest_rl.types import FloatArray
 
@@ -21,7 +21,7 @@ N_FRAMES = 8
 class Look:
     """How the score sees one episode; what is not looked at is neither rendered nor scored."""
 
-    scorer: Scorer
+    scorer: StateScorer
     """Of the dataset."""
     states: NDArray[np.float64]
     """(T+1, nq) simulator positions."""
@@ -40,12 +40,12 @@ class Look:
     @cached_property
     def scores(self) -> FloatArray:
         """(T+1,) of all views together."""
-        return self.scorer.score_episodes([self.states])[0][0]
+        return self.scorer.score_episode(self.states)
 
     @cached_property
     def by_view(self) -> FloatArray:
         """(V, T+1), each view's own."""
-        return self.scorer.score_by_view(self.states)
+        return self.scorer.by_view(self.states)
 
     @cached_property
     def pixel_difference(self) -> FloatArray:
@@ -56,6 +56,6 @@ class Look:
 
     def _render(self, states: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
         """Render each distinct state once: (U, V, H, W, 3), and which of them each state is."""
-        views = self.scorer.config.views
+        views = self.scorer.embedder.config.views
         distinct, index = np.unique(canonical_states(states, views), axis=0, return_inverse=True)
         return np.stack([views.shared_renderer().render(state) for state in distinct]), index.reshape(-1)

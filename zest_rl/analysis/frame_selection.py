@@ -14,7 +14,8 @@ from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.env import progress_of
 from zest_rl.kitchen.tasks import SUCCESS_PROGRESS, TASKS, Task
 from zest_rl.metrics.selection import others
-from zest_rl.rewards.scorer import Scorer, ScorerConfig
+from zest_rl.rewards.scorer import ScorerConfig
+from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.simulation.views import Views, canonical_states
 
 Context = Literal["same", "different"]
@@ -99,13 +100,13 @@ def draw_candidates(dataset_ids: Sequence[str], n_frames: int, seed: int = 0) ->
     return Candidates(np.stack(states), np.array(trajectory, dtype=np.intp), tuple(tasks), np.stack(starts))
 
 
-def draw_goals(scorer: Scorer, n_goals: int | None, seed: int) -> Scorer:
+def draw_goals(scorer: StateScorer, n_goals: int | None, seed: int) -> StateScorer:
     """Return a scorer with `n_goals` of the goals, drawn with `seed`; with all of them for None.
 
     Raises:
         BadInput: there are fewer.
     """
-    n = scorer.goals.shape[-2]
+    n = scorer.scorer.goals.shape[-2]
     if n_goals is None:
         return scorer
     if not 1 <= n_goals <= n:
@@ -116,6 +117,7 @@ def draw_goals(scorer: Scorer, n_goals: int | None, seed: int) -> Scorer:
 def score_as_goals(
     candidates: Candidates,
     config: ScorerConfig,
+    views: Views,
     *,
     context: Context = "same",
     n_repeats: int = 1,
@@ -128,6 +130,7 @@ def score_as_goals(
     Args:
         candidates: M of them.
         config: the goal, and how it is compared.
+        views: of the goal's task.
         context: where x_0 comes from.
         n_repeats: R, over which goals and contexts are drawn anew.
         n_goals: pictures of the goal per repeat, default all.
@@ -137,7 +140,7 @@ def score_as_goals(
     Returns:
         (R, M) float64.
     """
-    whole = Scorer.build(config, candidates.starts[0], n_workers=n_workers)
+    whole = StateScorer.build(config, views, candidates.starts[0], n_workers=n_workers)
     rows = []
     for repeat in range(n_repeats):
         scorer = draw_goals(whole, n_goals, repeat)
@@ -148,6 +151,7 @@ def score_as_goals(
 def score_as_actions(
     candidates: Candidates,
     config: ScorerConfig,
+    views: Views,
     *,
     n_repeats: int = 1,
     n_goals: int | None = None,
@@ -161,6 +165,7 @@ def score_as_actions(
     Args:
         candidates: M of them, of several tasks.
         config: the goal, and how it is compared.
+        views: of the goal's task.
         n_repeats: R, over which goals are drawn anew.
         n_goals: pictures of the goal per repeat, default all.
         n_workers: processes that embed, default one per core.
@@ -169,7 +174,7 @@ def score_as_actions(
     Returns:
         (R, M) float64.
     """
-    goal = Scorer.build(config, candidates.starts[0], n_workers=n_workers)
+    goal = StateScorer.build(config, views, candidates.starts[0], n_workers=n_workers)
     first = candidates.contexts("same", 0)
     scores = np.empty((n_repeats, len(candidates.states)))
     for name in sorted(set(candidates.task)):

@@ -24,8 +24,8 @@ from zest_rl.embedders import Embedder
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.task_sequence import Performance
 from zest_rl.rewards.goals import TEXT, GoalSpec, embed_goal, read_folder, read_text
-from zest_rl.rewards.scorer import Scorer
 from zest_rl.rewards.scores import Features, Similarity, score_views
+from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.types import FloatArray, Frame
 
 
@@ -71,7 +71,7 @@ def rise_in_order(sub_goals: Sequence[SubGoalScores]) -> bool:
 
 def score_performance(
     performance: Performance,
-    build_scorer: Callable[[str], Scorer],
+    build_scorer: Callable[[str], StateScorer],
     on_done: Callable[[], object] = lambda: None,
 ) -> list[SubGoalScores]:
     """Score all states by the goal of each task, seen from that task's views.

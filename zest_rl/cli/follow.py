@@ -105,15 +105,16 @@ def run(config: KitchenArguments | VideoArguments, ui: Ui) -> dict[str, Any]:
 def _kitchen(config: KitchenArguments, ui: Ui) -> list[SubGoalScores]:
     from zest_rl.analysis.sub_goals import score_performance
     from zest_rl.kitchen.task_sequence import perform
-    from zest_rl.rewards.scorer import Scorer, ScorerConfig
+    from zest_rl.rewards.scorer import ScorerConfig
+    from zest_rl.rewards.state_scorer import StateScorer
     from zest_rl.simulation.views import Views
 
     performance = perform(config.tasks, config.seed)
 
-    def build(task: str) -> Scorer:
+    def build(task: str) -> StateScorer:
         views = Views(task, config.views, tolerance=config.tolerance)
-        scorer = ScorerConfig(views, config.goal, config.embedder, config.features, config.similarity, config.precision)
-        return Scorer.build(scorer, performance.states[0], device=config.device, n_workers=config.n_workers)
+        scorer = ScorerConfig(config.goal, config.embedder, config.features, config.similarity, config.precision)
+        return StateScorer.build(scorer, views, performance.states[0], device=config.device, n_workers=config.n_workers)
 
     with ui.progress("sub-goals", len(config.tasks)) as advance:
         return score_performance(performance, build, advance)

@@ -70,22 +70,29 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     import numpy as np
 
     from zest_rl.data import reader
-    from zest_rl.sources import is_kitchen
+    from zest_rl.rewards.relabel import relabel
 
     started = time.monotonic()
-    frames_are_rendered = not (config.frames or config.camera) and is_kitchen(config.dataset)
-    result = (_from_states if frames_are_rendered else _from_frames)(config, ui)
-    if result.pop("already_there"):
-        ui.say(f"{result['dataset']} is there already, nothing to do")
-    returns = np.array([rewards.sum() for rewards in reader.read_rewards(result["dataset"])])
+    with progress_in_parts(ui, "embedding frames") as on_progress:
+        relabeled = relabel(**vars(config), on_progress=on_progress)
+    if relabeled.already_there:
+        ui.say(f"{relabeled.dataset_id} is there already, nothing to do")
+    if relabeled.source.frames.describe().get("qpos_is_noisy"):
+        ui.warn("states are read from observations that the environment blurred: what is shown trembles a little")
+    returns = np.array([rewards.sum() for rewards in reader.read_rewards(relabeled.dataset_id)])
     if np.ptp(returns) == 0:
         ui.warn("all episodes have the same return: this goal and embedder tell nothing apart")
     return {
-        **result,
+        "dataset": relabeled.dataset_id,
+        "path": str(relabeled.path),
+        "n_frames": relabeled.n_frames,
+        "views": list(relabeled.source.frames.views),
+        f"n_{relabeled.unit}_embedded": relabeled.n_embedded,
+        "n_still_frames": relabeled.n_still,
         "return_min": float(returns.min()),
         "return_max": float(returns.max()),
         "seconds": round(time.monotonic() - started, 2),
-        "next": _next(result["dataset"]),
+        "next": _next(relabeled.dataset_id),
     }
 
 
@@ -101,85 +108,3 @@ def _next(dataset_id: str) -> str:
             return f"zest inspect {dataset_id}"
         trains = all(not acts_discretely(file[name]) and np.abs(file[name]["actions"][()]).max() <= 1 for name in names)
     return f"zest train dt {dataset_id}" if trains else f"zest export {dataset_id} --to npz"
-
-
-def _from_states(config: Config, ui: Ui) -> dict[str, Any]:
-    """Relabel a dataset of the kitchen."""
-    from zest_rl.data import reader
-    from zest_rl.rewards.relabel import relabel
-    from zest_rl.rewards.scorer import ScorerConfig
-    from zest_rl.simulation.views import Views
-
-    views = Views(
-        task=reader.task_name(config.dataset),
-        n_views=config.views,
-        robot=config.show_robot,
-        tolerance=config.tolerance,
-    )
-    scorer_config = ScorerConfig(
-        views,
-        config.goal,
-        config.embedder,
-        config.features,
-        config.similarity,
-        config.precision,
-        config.goal_share,
-    )
-    with progress_in_parts(ui, "rendering and embedding") as on_progress:
-        relabeled = relabel(
-            config.dataset,
-            scorer_config,
-            reward=config.reward,
-            shuffle=config.shuffle,
-            device=config.device,
-            n_workers=config.n_workers,
-            engine=config.engine,
-            on_progress=on_progress,
-        )
-    return {
-        "dataset": relabeled.dataset_id,
-        "path": str(relabeled.path),
-        "n_frames": relabeled.n_frames,
-        "n_distinct_states_embedded": relabeled.scorer.states.n_embedded,
-        "n_still_frames": relabeled.n_still,
-        "already_there": relabeled.already_there,
-    }
-
-
-def _from_frames(config: Config, ui: Ui) -> dict[str, Any]:
-    """Relabel a dataset of another robot, or the kitchen's by other frames."""
-    from zest_rl.rewards.frame_embeddings import FrameScorerConfig
-    from zest_rl.rewards.relabel_frames import relabel_frames
-    from zest_rl.sources import open_source
-
-    own = [name for name in ("views", "show_robot", "tolerance") if getattr(config, name) != getattr(Config, name)]
-    if own:
-        flags = " and ".join(f"--{name.replace('_', '-')}" for name in own)
-        raise BadInput(f"{flags} belong to the kitchen's own renderer, not to frames from elsewhere; leave them out")
-    source = open_source(config.dataset, frames=config.frames, cameras=config.camera)
-    scorer_config = FrameScorerConfig(
-        config.goal, config.embedder, config.features, config.similarity, config.precision, config.goal_share
-    )
-    ui.say(f"frames: {', '.join(source.frames.views)}")
-    if source.frames.describe().get("qpos_is_noisy"):
-        ui.warn("states are read from observations that the environment blurred: what is shown trembles a little")
-    with progress_in_parts(ui, "reading and embedding") as on_progress:
-        relabeled = relabel_frames(
-            source,
-            scorer_config,
-            reward=config.reward,
-            shuffle=config.shuffle,
-            device=config.device,
-            n_workers=config.n_workers,
-            engine=config.engine,
-            on_progress=on_progress,
-        )
-    return {
-        "dataset": relabeled.dataset_id,
-        "path": str(relabeled.path),
-        "n_frames": relabeled.n_frames,
-        "views": list(source.frames.views),
-        "n_episodes_embedded": relabeled.n_embedded,
-        "n_still_frames": relabeled.n_still,
-        "already_there": relabeled.already_there,
-    }

@@ -25,7 +25,7 @@ from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.env import ENV_ID
 from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return, wilson
 from zest_rl.rewards.relabel import SCORER_FILE, Reward
-from zest_rl.rewards.scorer import Scorer
+from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.parallel import cached_jobs, chunks, one_thread, read_parts
 from zest_rl.types import EpisodeResult
@@ -125,7 +125,7 @@ def _reward_kind(policy: Policy) -> Reward | None:
 
 
 def rollout(
-    policy: Policy, env_spec: str, seeds: range, config: EvaluationConfig, scorer: Scorer | None = None
+    policy: Policy, env_spec: str, seeds: range, config: EvaluationConfig, scorer: StateScorer | None = None
 ) -> Arrays:
     """Run one episode per seed, in lockstep.
 
@@ -223,9 +223,9 @@ def _decrement(
 
 
 @functools.lru_cache(maxsize=2)
-def _scorer(path: Path, sha256: str) -> Scorer:
+def _scorer(path: Path, sha256: str) -> StateScorer:
     """Load a scorer once per process; `sha256` tells a changed file apart."""
-    return Scorer.load(path, n_workers=1)
+    return StateScorer.load(path, n_workers=1)
 
 
 def _evaluate_part(job: tuple[Path, EvaluationConfig, range, bool, str]) -> Arrays:
@@ -235,7 +235,7 @@ def _evaluate_part(job: tuple[Path, EvaluationConfig, range, bool, str]) -> Arra
     with one_thread():
         arrays = rollout(policy, policy.meta["dataset"]["env_spec"], seeds, config, scorer)
     if scorer is not None:
-        scorer.states.flush()
+        scorer.flush()
     return arrays
 
 

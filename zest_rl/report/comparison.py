@@ -21,7 +21,7 @@ from zest_rl.report import Curve, MethodRow, Report, Section
 from zest_rl.report.content import Kind
 from zest_rl.report.panels import episode_panels, goal_panel, goal_scatter, paired_panels
 from zest_rl.rewards.relabel import SCORER_FILE
-from zest_rl.rewards.scorer import Scorer
+from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 from zest_rl.simulation.videos import Film, ensure_video
 from zest_rl.training.checkpoints import snapshots
@@ -260,11 +260,11 @@ def compare(
     scatters = {name: goal_scatter(name, dataset_id) for name, dataset_id in goals.items()}
     scorer = None
     if goals:
-        scorer = Scorer.load(reader.dataset_path(next(iter(goals.values()))) / SCORER_FILE)
+        scorer = StateScorer.load(reader.dataset_path(next(iter(goals.values()))) / SCORER_FILE)
     shown = [method for method in methods if method.kind == "method"]
     panels = [p for m in shown for p in episode_panels(m.name, evaluations[m.name][0], scorer, film)]
     if scorer is not None:
-        scorer.states.flush()
+        scorer.flush()
     cloned = next((method.name for method in shown if _agent(metas, method) == "bc"), None)
     if cloned is not None:
         first = {name: (name, of_seeds[0]) for name, of_seeds in evaluations.items()}

@@ -17,7 +17,7 @@ from zest_rl.metrics import statistics
 from zest_rl.report import EpisodePanel, GoalPanel, Scatter
 from zest_rl.rewards.goals import read_goal, read_text
 from zest_rl.rewards.relabel import GOAL_FOLDER
-from zest_rl.rewards.scorer import Scorer
+from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 from zest_rl.simulation.videos import FPS, Film, Video, representative
 from zest_rl.types import FloatArray
@@ -50,7 +50,7 @@ def goal_panel(name: str, dataset_id: str, scatter: Scatter | None = None) -> Go
     return GoalPanel(name, sentences.starts, tuple(sentences.goals[k] for k in kept), *ranking)
 
 
-def episode_panels(name: str, evaluation: Evaluation, scorer: Scorer | None, film: Film) -> list[EpisodePanel]:
+def episode_panels(name: str, evaluation: Evaluation, scorer: StateScorer | None, film: Film) -> list[EpisodePanel]:
     """Best, median and worst episode of an evaluation: video, score over time, ground-truth progress."""
     panels = []
     folder = evaluation_folder(evaluation.run, evaluation.config)
@@ -58,7 +58,7 @@ def episode_panels(name: str, evaluation: Evaluation, scorer: Scorer | None, fil
         states: NDArray[np.float64] = evaluation.traces["qpos"][index]
         video = film(Video(states, folder / f"{which}.mp4"))
         panel = _panel(f"{name}: {which}", name, evaluation, index, video)
-        panels.append(replace(panel, scores=None if scorer is None else scorer.score_episodes([states])[0][0]))
+        panels.append(replace(panel, scores=None if scorer is None else scorer.score_episode(states)))
     return panels
 
 

@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 
 from zest_rl.data.images import list_images, read_image
 from zest_rl.errors import BadInput
-from zest_rl.kitchen.tasks import Task
+from zest_rl.kitchen.tasks import Task, get_task
 from zest_rl.runtime import artifacts
+from zest_rl.simulation.views import Views, scene_pair
 from zest_rl.types import Frame
 
 SAME_SCENE, DRAWINGS, VISUAL_TASKS, OWN_TEXT, TEXT = "same-scene", "drawings", "visual-tasks:", "text", "text:"
@@ -158,6 +159,22 @@ def read_goal(spec: str, task: Task, scene: tuple[NDArray[np.uint8], NDArray[np.
         return GoalSpec(spec, (task.start_text,), (task.goal_text,))
     folder = goal_folder(spec, task)
     return read_text(spec) if folder is None else read_folder(folder, spec)
+
+
+def read_kitchen_goal(spec: str, views: Views, scene_qpos: NDArray[np.float64]) -> GoalSpec:
+    """Read a goal spec of a kitchen task, and render the scene where it is the goal.
+
+    Args:
+        spec: of any kind.
+        views: of the task.
+        scene_qpos: (nq,) a start state.
+
+    Raises:
+        BadInput: as `read_goal`.
+    """
+    task = get_task(views.task)
+    scene = scene_pair(views.shared_renderer(), scene_qpos, task) if spec == SAME_SCENE else None
+    return read_goal(spec, task, scene)
 
 
 def read_free_goal(spec: str) -> GoalSpec:

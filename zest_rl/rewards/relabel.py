@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from zest_rl.data import reader
-from zest_rl.data.writer import write_relabeled
+from zest_rl.data.provenance import RelabelRecord, ScorerRecord
+from zest_rl.data.writer import write_scored
+from zest_rl.embedders import DEFAULT_EMBEDDER, Precision
 from zest_rl.errors import BadInput, nearest
-from zest_rl.rewards.goals import GoalSpec
+from zest_rl.rewards.embeddings import EpisodeEmbeddings
+from zest_rl.rewards.frame_embeddings import FrameEmbeddings
+from zest_rl.rewards.goals import GoalSpec, read_free_goal, read_kitchen_goal
 from zest_rl.rewards.scorer import Scorer, ScorerConfig
+from zest_rl.rewards.scores import Features, Similarity
+from zest_rl.rewards.state_embeddings import EmbedConfig, StateEmbedder, StateEmbeddings
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.parallel import Engine
+from zest_rl.simulation.views import Views
+from zest_rl.sources import KitchenStates, Source, open_source
 from zest_rl.types import FloatArray
 
 Reward = Literal["level", "difference"]
@@ -34,11 +41,21 @@ class Relabeled:
 
     dataset_id: str
     path: Path
+    source: Source
     scorer: Scorer
     n_frames: int
+    """Scored frames of one view: T + 1 per episode."""
+    n_embedded: int
+    """Of what the embeddings' unit says, those that were not in the cache."""
+    unit: str
+    """``distinct_states``, or ``episodes``."""
     n_still: int | None
     """Frames without any change against their first frame; None when the dataset was there already."""
-    already_there: bool
+
+    @property
+    def already_there(self) -> bool:
+        """Whether there was nothing to do."""
+        return self.n_still is None
 
 
 def rewards_from_scores(scores: FloatArray, reward: Reward = "level") -> FloatArray:
@@ -76,55 +93,36 @@ def relabeled_id(source_id: str, digest: str) -> str:
     return re.sub(r"-v(\d+)$", rf"-zest-{digest[:8]}-v\1", source_id)
 
 
-class AnyScorer(Protocol):
-    """What `record` asks of a scorer."""
-
-    @property
-    def config(self) -> Any:
-        """It says features, similarity and embedder."""
-
-    def describe(self) -> dict[str, Any]:
-        """Config and content hashes, JSON-ready."""
-
-
-def record(
-    scorer: AnyScorer,
-    source: Mapping[str, Any],
-    *,
-    reward: Reward,
-    shuffle: int | None,
-    kept: NDArray[np.intp] | None,
-    n_still: int,
-) -> dict[str, Any]:
-    """What a relabeled dataset tells of how it was made: ``description`` and ``zest`` of the writers.
-
-    Args:
-        scorer: what scored.
-        source: what was scored, JSON-ready.
-        reward: see `relabel`.
-        shuffle: see `relabel`.
-        kept: indices of the goals that were used; None: all.
-        n_still: frames without any change against their first frame.
-    """
-    config = scorer.config
-    return {
-        "description": f"Rewards are scores ({config.similarity}+{config.features}, {reward}) by {config.embedder}.",
-        "zest": {
-            "relabel": {
-                **source,
-                "reward": reward,
-                "shuffle": shuffle,
-                "kept_goals": None if kept is None else kept.tolist(),
-                "scorer": scorer.describe(),
-                "n_still_frames": n_still,
-                "provenance": artifacts.provenance(),
-            }
-        },
-    }
-
-
 def relabel(
-    source_id: str,
+    dataset: str,
+    goal: str = "same-scene",
+    *,
+    frames: Sequence[str] = (),
+    camera: Sequence[str] = (),
+    views: int = Views.n_views,
+    show_robot: bool = Views.robot,
+    tolerance: float = Views.tolerance,
+    embedder: str = DEFAULT_EMBEDDER,
+    features: Features = "delta",
+    similarity: Similarity = "cos",
+    precision: Precision = "auto",
+    goal_share: float = 1.0,
+    **options: Any,
+) -> Relabeled:
+    """Write a copy of a dataset whose rewards are ZeST scores, by the arguments of `zest relabel`.
+
+    `dataset` and `frames` … `tolerance` say what is seen (`open_source`), `goal` and `embedder` … `goal_share` how it
+    is scored (`ScorerConfig`); the other options and the errors are those of `relabel_source`.
+    """
+    config = ScorerConfig(goal, embedder, features, similarity, precision, goal_share)
+    source = open_source(
+        dataset, frames=frames, cameras=camera, n_views=views, show_robot=show_robot, tolerance=tolerance
+    )
+    return relabel_source(source, config, **options)
+
+
+def relabel_source(
+    source: Source,
     config: ScorerConfig,
     *,
     reward: Reward = "level",
@@ -134,71 +132,102 @@ def relabel(
     engine: Engine = "local",
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Relabeled:
-    """Write a copy of a dataset whose rewards are ZeST scores; the ground truth stays in the infos, unread.
+    """Write a copy of a dataset whose rewards are ZeST scores.
+
+    The ground truth stays in the infos, unread; rewards that the dataset came with otherwise are kept beside the new
+    ones, as ``infos/source/reward``.
 
     Args:
-        source_id: a dataset with recorded simulator state.
+        source: episodes and their frames.
         config: the scorer.
         reward: the level of the score at each step, or its change.
         shuffle: null control: give each episode the scores of another one, drawn with this seed.
         device: where the embedder runs.
-        n_workers: processes that render and embed, default one per core.
+        n_workers: processes that read or render, and embed; default one per core.
         engine: processes of this machine, or workers of a Ray cluster; the rewards are the same.
         on_progress: called with (parts embedded, parts in all).
 
     Raises:
-        BadInput: the dataset, goal or embedder is not there or does not fit.
-        ZestError: the disk is full or read-only; nothing is left behind.
+        BadInput: the goal, the embedder or the frames do not fit.
+        ZestError: the disk is full or read-only; nothing is left behind but finished embeddings.
     """
-    states = reader.read_states(source_id)
-    scorer = Scorer.build(config, states[0][0], device=device, n_workers=n_workers, engine=engine)
-    source_fingerprint = reader.fingerprint(source_id)
-    digest = artifacts.hash_json([source_fingerprint, scorer.fingerprint(), reward, shuffle])
-    target_id = relabeled_id(source_id, digest)
+    trajectories = source.trajectories
+    scorer, embeddings = _open(source, config, device, n_workers, engine)
+    source_sha256 = trajectories.fingerprint()
+    digest = artifacts.hash_json([source_sha256, *embeddings.identity(), scorer.fingerprint(), reward, shuffle])
+    target_id = relabeled_id(trajectories.dataset_id, digest)
     path = reader.dataset_path(target_id)
-    n_frames = sum(map(len, states))
+
+    def result(scorer: Scorer, n_still: int | None) -> Relabeled:
+        n_frames = sum(trajectories.n_steps) + len(trajectories.n_steps)
+        n_embedded = embeddings.n_embedded
+        return Relabeled(target_id, path, source, scorer, n_frames, n_embedded, embeddings.unit, n_still)
 
     def find() -> Relabeled:
         """Return the dataset that is there already, and a scorer with the goals that it was scored by."""
-        kept = reader.read_metadata(target_id)["zest"]["relabel"]["kept_goals"]
-        if kept is not None:
-            scorer.keep_goals(np.array(kept))
-        return Relabeled(target_id, path, scorer, n_frames, None, already_there=True)
+        with reader.open_dataset(target_id) as there:
+            made = there.record.relabel
+        kept = None if made is None else made.kept_goals
+        return result(scorer if kept is None else scorer.with_goals(np.array(kept)), None)
 
     if reader.exists(target_id):
         return find()
     with artifacts.lock(path):
         if reader.exists(target_id):  # an equal call that ran at the same time
             return find()
-        kept = scorer.select_goals(states, on_progress) if config.goal_share < 1 else None
-        scores, n_still = scorer.score_episodes(states, on_progress)
+        embeddings.embed(on_progress)
+        kept = scorer.goals_near(embeddings) if config.goal_share < 1 else None
+        scorer = scorer if kept is None else scorer.with_goals(kept)
+        scores, n_still = scorer.score_episodes(embeddings)
         if shuffle is not None:
             scores = shuffled(scores, shuffle)
-        write_relabeled(
-            source_id,
+        record = RelabelRecord(
+            source=trajectories.dataset_id,
+            source_sha256=source_sha256,
+            **embeddings.describe(),
+            reward=reward,
+            shuffle=shuffle,
+            kept_goals=None if kept is None else tuple(kept.tolist()),
+            scorer=ScorerRecord.from_json(scorer.describe()),
+            n_still_frames=n_still,
+            provenance=artifacts.provenance(),
+        )
+        write_scored(
+            trajectories,
             target_id,
             [rewards_from_scores(score, reward) for score in scores],
             scores,
-            **record(
-                scorer,
-                {"source": source_id, "source_sha256": source_fingerprint},
-                reward=reward,
-                shuffle=shuffle,
-                kept=kept,
-                n_still=n_still,
-            ),
+            description=f"Rewards are scores ({config.similarity}+{config.features}, {reward}) by {config.embedder}.",
+            zest={"relabel": record.to_json()},
             extra=lambda folder: _leave_scorer(folder, scorer),
         )
-    return Relabeled(target_id, path, scorer, n_frames, n_still, already_there=False)
+    return result(scorer, n_still)
+
+
+def _open(
+    source: Source, config: ScorerConfig, device: str, n_workers: int | None, engine: Engine
+) -> tuple[Scorer, EpisodeEmbeddings]:
+    """Build the scorer, and open the embeddings: of distinct states where frames are rendered from them."""
+    frames = source.frames
+    if not isinstance(frames, KitchenStates):
+        scorer = Scorer.build(config, read_free_goal(config.goal), device=device)
+        options: dict[str, Any] = {"device": device, "n_workers": n_workers, "engine": engine}
+        return scorer, FrameEmbeddings(source, config.embedder, config.precision, **options)
+    goal = read_kitchen_goal(config.goal, frames.ring, frames.states[0][0])
+    embedder = StateEmbedder(
+        EmbedConfig(frames.ring, config.embedder, config.precision, device), n_workers=n_workers, engine=engine
+    )
+    return Scorer.build(config, goal, views=frames.ring, device=device), StateEmbeddings(embedder, frames.states)
 
 
 def _leave_scorer(folder: Path, scorer: Scorer) -> None:
-    """Leave the scorer, for online scores, and the goal in a dataset's folder."""
-    scorer.save(folder / SCORER_FILE)
-    leave_goal(folder, scorer.goal)
+    """Leave the goal in a dataset's folder, and the scorer where it can score online."""
+    if scorer.views is not None:
+        scorer.save(folder / SCORER_FILE)
+    _leave_goal(folder, scorer.goal)
 
 
-def leave_goal(folder: Path, goal: GoalSpec | None) -> None:
+def _leave_goal(folder: Path, goal: GoalSpec | None) -> None:
     """Leave small pictures of the goal, for reports, in a dataset's folder; nothing of sentences."""
     if goal is None or goal.is_text:
         return

@@ -1,4 +1,4 @@
-"""A goal, an embedder and a ring of views, joined into one object that scores simulator states.
+"""A goal and an embedder, joined into one object that scores embedded frames, wherever they come from.
 
 The same scorer relabels a dataset and scores a rollout online. It is saved beside what it made as a small safetensors
 file (the goal's embeddings) with its config, so that neither the goal pictures nor their folder are needed later.
@@ -6,20 +6,19 @@ file (the goal's embeddings) with its config, so that neither the goal pictures 
 
 from __future__ import annotations
 
-import copy
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.embedders import Embedder, Precision
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.kitchen.tasks import get_task
-from zest_rl.rewards.goals import SAME_SCENE, GoalSpec, embed_goal, read_goal
+from zest_rl.rewards.embeddings import EmbeddedEpisode, shared_embedder
+from zest_rl.rewards.goals import GoalSpec, embed_goal
 from zest_rl.rewards.scores import (
     NUMBERS,
     Features,
@@ -29,19 +28,17 @@ from zest_rl.rewards.scores import (
     score_views,
     zero_deltas,
 )
-from zest_rl.rewards.state_embeddings import EmbedConfig, StateEmbedder
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_arrays, write_arrays
-from zest_rl.runtime.parallel import Engine, one_thread
-from zest_rl.simulation.views import Views, canonical_states, scene_pair
+from zest_rl.runtime.parallel import one_thread
+from zest_rl.simulation.views import Views
 from zest_rl.types import FloatArray
 
 
 @dataclass(frozen=True)
 class ScorerConfig:
-    """Everything that a score depends on, besides the states."""
+    """Everything that a score depends on, besides the frames."""
 
-    views: Views
     goal: str
     """Goal spec, see `zest_rl.rewards.goals`."""
     embedder: str = "efficientnet-lite0"
@@ -49,259 +46,120 @@ class ScorerConfig:
     similarity: Similarity = "cos"
     precision: Precision = "auto"
     goal_share: float = 1.0
-    """Share of the goals that are used: those that the episodes end nearest to (`Scorer.select_goals`)."""
+    """Share of the goals that are used: those that the episodes end nearest to (`Scorer.goals_near`)."""
 
     def __post_init__(self) -> None:
         check_names(self.features, self.similarity)
         check_goal_share(self.goal_share)
 
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> Self:
-        """Rebuild from ``dataclasses.asdict``."""
-        return cls(**{**values, "views": Views(**values["views"])})
+    def load_embedder(self, device: str = "auto") -> Embedder:
+        """Return the embedder, shared within the process; the default's network is loaded at its first picture."""
+        return shared_embedder(self.embedder, self.precision, device)
 
 
-class Scoring(Protocol):
-    """What a score depends on besides frames, goal and embedder: the fields of a scorer's config that say how."""
-
-    @property
-    def features(self) -> Features:
-        """See `zest_rl.rewards.scores`."""
-
-    @property
-    def similarity(self) -> Similarity:
-        """See `zest_rl.rewards.scores`."""
-
-    @property
-    def goal_share(self) -> float:
-        """Share of the goals that are used."""
-
-
-def how_scored(config: Scoring) -> list[Any]:
-    """What of a config changes a score, for hashes of it; JSON-ready."""
-    named = {"features": config.features, "similarity": config.similarity, "goal_share": config.goal_share}
-    rule = [] if config.goal_share == 1 else ["by last frames"]
-    return [named, *rule, *(f"{name} {number}" for name, number in NUMBERS.items() if name == config.features)]
-
-
-def goals_near(ends: Iterable[FloatArray], starts: FloatArray, goals: FloatArray, config: Scoring) -> NDArray[np.intp]:
-    """Return the share ``config.goal_share`` of the goals (at least one) that the episodes end nearest to.
-
-    The rule needs no ground truth ("goal images with high similarity", Cui et al. §5.3): kept are the goals by which
-    the last frames of the episodes score highest on average. It takes the data to lead somewhere: on behaviour without
-    intention it picks what resembles its end.
-
-    Args:
-        ends: (2, V, D) embeddings of the first and the last frame, per episode.
-        starts: see `score_views`.
-        goals: see `score_views`.
-        config: how frames are scored.
-
-    Returns:
-        Indices of the goals, in their order.
-    """
-    n_goals = goals.shape[-2]
-    at_end = np.zeros(n_goals)
-    for frames in ends:
-        for k in range(n_goals):
-            at_end[k] += score_views(frames, starts, goals[..., k : k + 1, :], config.features, config.similarity)[-1]
-    n_kept = max(1, round(config.goal_share * n_goals))
-    return np.sort(np.argsort(-at_end, kind="stable")[:n_kept])
-
-
+@dataclass(frozen=True, eq=False)
 class Scorer:
-    """Scores simulator states by a goal: φ of `zest_rl.rewards.scores`, averaged over goals and views."""
+    """Scores frames by a goal: φ of `zest_rl.rewards.scores`, averaged over goals and views."""
 
-    def __init__(
-        self,
-        config: ScorerConfig,
-        starts: FloatArray,
-        goals: FloatArray,
-        goal_fingerprint: str,
-        *,
-        device: str = "auto",
-        n_workers: int | None = None,
-        engine: Engine = "local",
-    ) -> None:
-        """Join the parts; use `Scorer.build` or `Scorer.load`.
-
-        Args:
-            config: what is scored how.
-            starts: (S, D), or (V, S, D) for a goal of its own per view.
-            goals: (K, D) or (V, K, D).
-            goal_fingerprint: hash of the goal's content.
-            device: where the embedder runs.
-            n_workers: processes that embed many states, default one per core.
-            engine: processes of this machine, or workers of a Ray cluster.
-        """
-        self.config, self.starts, self.goals, self.goal_fingerprint = config, starts, goals, goal_fingerprint
-        embed_config = EmbedConfig(config.views, config.embedder, config.precision, device)
-        self.goal: GoalSpec | None = None
-        """The goal itself; None when only its embeddings were loaded."""
-        self.states = StateEmbedder(embed_config, n_workers=n_workers, engine=engine)
+    config: ScorerConfig
+    starts: FloatArray
+    """(S, D), or (V, S, D) for a goal that differs by view."""
+    goals: FloatArray
+    """(K, D) or (V, K, D)."""
+    goal_sha256: str
+    """Of the goal's content, before any choice among its pictures."""
+    embedder_sha256: str
+    views: Views | None = None
+    """Of the kitchen, which the frames are rendered from; None: the frames are not ours to render."""
+    goal: GoalSpec | None = None
+    """The goal itself; None when only its embeddings were loaded."""
 
     @classmethod
-    def build(cls, config: ScorerConfig, scene_qpos: NDArray[np.float64], **options: Any) -> Self:
-        """Read and embed the goal.
-
-        Args:
-            config: what is scored how.
-            scene_qpos: (nq,) a start state of the scene, for same-scene goals.
-            options: see the constructor.
+    def build(cls, config: ScorerConfig, goal: GoalSpec, *, views: Views | None = None, device: str = "auto") -> Self:
+        """Embed the goal.
 
         Raises:
-            BadInput: the goal cannot be read, or the embedder does not read its kind.
+            BadInput: the embedder does not read the goal's kind.
         """
-        task = get_task(config.views.task)
-        same_scene = config.goal == SAME_SCENE
-        scene = scene_pair(config.views.shared_renderer(), scene_qpos, task) if same_scene else None
-        goal = read_goal(config.goal, task, scene)
-        device = options.get("device", "auto")
-        embedder = EmbedConfig(config.views, config.embedder, config.precision, device).load_embedder()
+        embedder = config.load_embedder(device)
         starts, goals = embed_goal_cached(goal, embedder)
-        scorer = cls(config, starts, goals, goal.fingerprint(), **options)
-        scorer.goal = goal
-        return scorer
+        return cls(config, starts, goals, goal.fingerprint(), embedder.fingerprint, views, goal)
 
-    def score_episodes(
-        self, states: Sequence[NDArray[np.float64]], on_progress: Callable[[int, int], None] | None = None
-    ) -> tuple[list[FloatArray], int]:
+    def score(self, embeddings: FloatArray) -> FloatArray:
+        """Score frames of one episode: (n, V, D) embeddings, the first of x_0 → (n,) float32."""
+        return score_views(embeddings, self.starts, self.goals, self.config.features, self.config.similarity)
+
+    def score_episode(self, episode: EmbeddedEpisode) -> FloatArray:
+        """Score all frames of an episode: (T+1,) float32."""
+        return self.score(episode.embeddings)[episode.index]
+
+    def score_episodes(self, episodes: Iterable[EmbeddedEpisode]) -> tuple[list[FloatArray], int]:
         """Score whole episodes.
-
-        Args:
-            states: (T+1, nq) simulator positions per episode.
-            on_progress: called with (parts embedded, parts in all).
 
         Returns:
             (T+1,) float32 scores per episode; and how many frames after the first had no change in any view.
         """
         scores, n_still = [], 0
-        for frames, inverse in self._frames(states, on_progress):
-            scores.append(self._score(frames)[1:][inverse])
-            still = np.all([zero_deltas(frames[:, view]) for view in range(frames.shape[1])], axis=0)
-            n_still += int(still[1:][inverse[1:]].sum())
+        for episode in episodes:
+            scores.append(self.score_episode(episode))
+            by_view = np.moveaxis(episode.embeddings, 1, 0)
+            still = np.all([zero_deltas(frames) for frames in by_view], axis=0)
+            n_still += int(still[episode.index[1:]].sum())
         return scores, n_still
 
-    def score_by_view(self, states: NDArray[np.float64]) -> FloatArray:
-        """Score one episode by each view alone: (T+1, nq) → (V, T+1) float32."""
-        ((frames, inverse),) = self._frames([states], None)
-        rows = []
-        for view in range(frames.shape[1]):
-            own = slice(view, view + 1)
-            starts, goals = (rows_[own] if rows_.ndim == 3 else rows_ for rows_ in (self.starts, self.goals))
-            scores = score_views(frames[:, own], starts, goals, self.config.features, self.config.similarity)
-            rows.append(scores[1:][inverse])
-        return np.stack(rows)
+    def by_view(self, episode: EmbeddedEpisode) -> FloatArray:
+        """Score one episode by each view alone: (V, T+1) float32."""
+        n_views = episode.embeddings.shape[1]
+        return np.stack([self._of_view(v).score_episode(_one_view(episode, v)) for v in range(n_views)])
 
-    def select_goals(
-        self, states: Sequence[NDArray[np.float64]], on_progress: Callable[[int, int], None] | None = None
-    ) -> NDArray[np.intp]:
-        """Keep the share ``config.goal_share`` of the goals (at least one) and forget the others.
+    def _of_view(self, view: int) -> Scorer:
+        if self.starts.ndim == 2:
+            return self
+        alone = slice(view, view + 1)
+        return replace(self, starts=self.starts[alone], goals=self.goals[alone])
 
-        The rule is that of `goals_near`.
+    def goals_near(self, episodes: Iterable[EmbeddedEpisode]) -> NDArray[np.intp]:
+        """Return the share ``config.goal_share`` of the goals (at least one) that the episodes end nearest to.
 
-        Args:
-            states: (T+1, nq) simulator positions per episode.
-            on_progress: called with (parts embedded, parts in all).
+        The rule needs no ground truth ("goal images with high similarity", Cui et al. §5.3): kept are the goals by
+        which the last frames of the episodes score highest on average. It takes the data to lead somewhere: on
+        behaviour without intention it picks what resembles its end.
 
         Returns:
-            Indices of the goals that are kept, in their order.
+            Indices of the goals, in their order.
         """
-        ends = (frames[[0, 1 + inverse[-1]]] for frames, inverse in self._frames(states, on_progress))
-        kept = goals_near(ends, self.starts, self.goals, self.config)
-        self.keep_goals(kept)
-        return kept
+        n_goals = self.goals.shape[-2]
+        alone = [self.with_goals(np.array([k])) for k in range(n_goals)]
+        at_end = np.zeros(n_goals)
+        for episode in episodes:
+            at_end += [scorer.score(episode.ends)[-1] for scorer in alone]
+        n_kept = max(1, round(self.config.goal_share * n_goals))
+        return np.sort(np.argsort(-at_end, kind="stable")[:n_kept])
 
-    def seen_as(self, task: str) -> Scorer:
-        """Return a scorer with the same goals that sees states from the views of another task."""
-        config = replace(self.config, views=replace(self.config.views, task=task))
-        states = self.states
-        return Scorer(
-            config,
-            self.starts,
-            self.goals,
-            self.goal_fingerprint,
-            device=states.config.device,
-            n_workers=states.n_workers,
-            engine=states.engine,
-        )
-
-    def with_goals(self, kept: NDArray[np.intp]) -> Scorer:
-        """Return a scorer with the goals of these indices alone; both share what is embedded."""
-        one = copy.copy(self)
-        one.keep_goals(kept)
-        return one
-
-    def keep_goals(self, kept: NDArray[np.intp]) -> None:
-        """Keep the goals with these indices and forget the others."""
-        self.goals = self.goals[..., kept, :]
-        if self.goal is not None and not self.goal.per_view:
-            self.goal = replace(self.goal, goals=tuple(self.goal.goals[k] for k in kept))
-
-    def _frames(
-        self, states: Sequence[NDArray[np.float64]], on_progress: Callable[[int, int], None] | None
-    ) -> Iterator[tuple[FloatArray, NDArray[np.intp]]]:
-        """Yield per episode the (n, V, D) embeddings of x_0 and its distinct states, and which one each frame is."""
-        self.states.embed(np.concatenate(list(states)), on_progress)
-        for episode in states:
-            distinct, inverse = self.states.embedded(episode)  # resting objects repeat their state
-            yield np.concatenate([distinct[inverse[:1]], distinct]), inverse  # x_0 first, as the scores want it
-
-    def score_now(self, first: NDArray[np.float64], current: NDArray[np.float64]) -> FloatArray:
-        """Score one state of each of N running episodes.
-
-        Args:
-            first: (N, nq) their first states.
-            current: (N, nq) their current states.
-
-        Returns:
-            (N,) float32 scores.
-        """
-        scores = np.empty(len(current), dtype=np.float32)
-        _, group = np.unique(canonical_states(first, self.config.views), axis=0, return_inverse=True)
-        for same in range(group.max() + 1):  # mostly one group: the objects start alike
-            rows = np.flatnonzero(group.reshape(-1) == same)
-            frames = np.concatenate([self.states.embed_now(first[rows[:1]]), self.states.embed_now(current[rows])])
-            scores[rows] = self._score(frames)[1:]
-        return scores
-
-    def score_pairs(
-        self,
-        first: NDArray[np.float64],
-        current: NDArray[np.float64],
-        on_progress: Callable[[int, int], None] | None = None,
-    ) -> FloatArray:
-        """Score many states, each against a start of its own; all cores embed.
-
-        Args:
-            first: (N, nq) their x_0.
-            current: (N, nq).
-            on_progress: called with (parts embedded, parts in all).
-
-        Returns:
-            (N,) float32 scores.
-        """
-        self.states.embed(np.concatenate([first, current]), on_progress)
-        return self.score_now(first, current)
-
-    def _score(self, embeddings: FloatArray) -> FloatArray:
-        """(n, V, D) embeddings, the first of x_0 → (n,) scores."""
-        return score_views(embeddings, self.starts, self.goals, self.config.features, self.config.similarity)
+    def with_goals(self, kept: NDArray[np.intp]) -> Self:
+        """Return a scorer with the goals of these indices alone."""
+        goal = self.goal
+        if goal is not None and not goal.per_view:
+            goal = replace(goal, goals=tuple(goal.goals[k] for k in kept))
+        return replace(self, goals=self.goals[..., kept, :], goal=goal)
 
     def describe(self) -> dict[str, Any]:
         """Config and content hashes, JSON-ready: what provenance records."""
-        return {
-            "config": asdict(self.config),
-            "goal_sha256": self.goal_fingerprint,
-            "embedder_sha256": self.states.embedder.fingerprint,
-            "views_sha256": self.config.views.fingerprint(),
-        }
+        views = {} if self.views is None else {"views": asdict(self.views)}
+        views_sha256 = {} if self.views is None else {"views_sha256": self.views.fingerprint()}
+        hashes = {"goal_sha256": self.goal_sha256, "embedder_sha256": self.embedder_sha256, **views_sha256}
+        return {"config": {**views, **asdict(self.config)}, **hashes}
 
     def fingerprint(self) -> str:
-        """Hash of all that a score depends on; names of files and folders are left out."""
-        described = self.describe()
-        hashes = [described[k] for k in ("goal_sha256", "embedder_sha256", "views_sha256")]
-        return artifacts.hash_json([*how_scored(self.config), hashes])
+        """Hash of all that a score depends on besides the frames; names of files and folders are left out."""
+        config = self.config
+        how = {"features": config.features, "similarity": config.similarity, "goal_share": config.goal_share}
+        rule = [] if config.goal_share == 1 else ["by last frames"]
+        numbers = [f"{name} {number}" for name, number in NUMBERS.items() if name == config.features]
+        hashes: list[Any] = [self.goal_sha256, self.embedder_sha256]
+        if self.views is not None:
+            hashes = [[*hashes, self.views.fingerprint()]]
+        return artifacts.hash_json([how, *rule, *numbers, *hashes])
 
     def save(self, path: Path) -> None:
         """Write the goal's embeddings and the config as one safetensors file."""
@@ -312,7 +170,7 @@ class Scorer:
         artifacts.write_bytes(path, save(arrays, metadata=header))
 
     @classmethod
-    def load(cls, path: Path, **options: Any) -> Self:
+    def load(cls, path: Path, *, device: str = "auto") -> Self:
         """Read what `save` wrote.
 
         Raises:
@@ -325,18 +183,24 @@ class Scorer:
             with safe_open(path, framework="numpy") as file:
                 described = json.loads(file.metadata()["scorer"])
                 starts, goals = file.get_tensor("starts"), file.get_tensor("goals")
-            config, goal_fingerprint = ScorerConfig.from_dict(described["config"]), described["goal_sha256"]
+            values = dict(described["config"])
+            views = Views(**values.pop("views")) if "views" in values else None
+            config, goal_sha256 = ScorerConfig(**values), described["goal_sha256"]
         except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
             raise ZestError(f"the scorer {path} cannot be read ({error}); relabel the dataset again") from error
-        scorer = cls(config, starts, goals, goal_fingerprint, **options)
+        scorer = cls(config, starts, goals, goal_sha256, config.load_embedder(device).fingerprint, views)
         here = scorer.describe()
-        changed = [key for key in ("embedder_sha256", "views_sha256") if here[key] != described[key]]
+        changed = [key for key in ("embedder_sha256", "views_sha256") if here.get(key) != described.get(key)]
         if changed:
             raise ZestError(
                 f"the scorer {path} was made with another {' and '.join(k.removesuffix('_sha256') for k in changed)} "
                 "(weights, precision, or versions differ); relabel and train here, or use the versions of its meta.json"
             )
         return scorer
+
+
+def _one_view(episode: EmbeddedEpisode, view: int) -> EmbeddedEpisode:
+    return replace(episode, embeddings=episode.embeddings[:, view : view + 1])
 
 
 def embed_goal_cached(goal: GoalSpec, embedder: Embedder) -> tuple[FloatArray, FloatArray]:

@@ -10,15 +10,17 @@ embedded beside it: networks are exact only up to about 1e-6 across batch sizes 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.embedders import Embedder, Precision, load_embedder
-from zest_rl.errors import BadInput, ZestError
+from zest_rl.embedders import Embedder, Precision
+from zest_rl.errors import ZestError
+from zest_rl.rewards.embeddings import EmbeddedEpisode, check_same_embedder, shared_embedder
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_array, write_arrays
 from zest_rl.runtime.parallel import Engine, cached_jobs, chunks, counted, one_thread
@@ -41,27 +43,8 @@ class EmbedConfig:
     device: str = "auto"
 
     def load_embedder(self) -> Embedder:
-        """Return the embedder, shared within the process; the default's network is loaded at its first picture."""
+        """Return the embedder, shared within the process."""
         return shared_embedder(self.embedder, self.precision, self.device)
-
-
-@functools.lru_cache(maxsize=2)
-def shared_embedder(uri: str, precision: Precision, device: str) -> Embedder:
-    """Return this process's embedder of a URI, see `load_embedder`."""
-    return load_embedder(uri, device=device, precision=precision)
-
-
-def check_same_embedder(embedder: Embedder, fingerprint: str) -> None:
-    """Make sure that a worker's embedder is that of the process that asked: the cache goes by the latter.
-
-    Raises:
-        BadInput: weights, precision or versions differ between the machines.
-    """
-    if embedder.fingerprint != fingerprint:
-        raise BadInput(
-            f"embedder {embedder.uri} of this worker is not that of the process that asked: weights, precision or "
-            "versions differ; install the same on every node, and choose --precision fp32 or bf16"
-        )
 
 
 @dataclass(frozen=True)
@@ -141,14 +124,8 @@ class StateEmbedder:
         self.n_embedded += len(missing)
         self._find()
 
-    def embedded(self, qpos: NDArray[np.float64]) -> tuple[FloatArray, NDArray[np.intp]]:
-        """Read what `embed` left; a few shards are in memory at a time.
-
-        Args:
-            qpos: (N, nq) simulator positions, such as those of an episode.
-
-        Returns:
-            (U, V, D) float32 embeddings of the U distinct states, and (N,) the index of each state among them.
+    def embedded(self, qpos: NDArray[np.float64]) -> EmbeddedEpisode:
+        """Read what `embed` left of one episode, (T+1, nq) simulator positions; a few shards are in memory at a time.
 
         Raises:
             ZestError: a file of the cache is damaged.
@@ -159,7 +136,8 @@ class StateEmbedder:
             if (row := self._row(key)) is None:
                 raise ZestError(f"embeddings in {self.folder} are missing or damaged; run the same command again")
             rows.append(row)
-        return np.stack(rows), np.asarray(inverse).reshape(-1)
+        inverse = np.asarray(inverse).reshape(-1)
+        return EmbeddedEpisode(np.stack([rows[inverse[0]], *rows]), 1 + inverse)
 
     def _row(self, key: bytes) -> FloatArray | None:
         """Return the (V, D) embeddings of a state, or None; a damaged shard is removed and forgotten."""
@@ -198,3 +176,33 @@ class StateEmbedder:
             write_arrays(path, {"keys": states, "embeddings": np.stack(rows[part.start : part.stop])})
         self._new.clear()
         self._find()
+
+
+class StateEmbeddings:
+    """The `EpisodeEmbeddings` of recorded simulator states."""
+
+    unit: ClassVar[str] = "distinct_states"
+
+    def __init__(self, embedder: StateEmbedder, states: Sequence[NDArray[np.float64]]) -> None:
+        """Take the (T+1, nq) simulator positions of every episode."""
+        self._embedder, self._states = embedder, states
+
+    @property
+    def n_embedded(self) -> int:
+        """Distinct states that were not in the cache."""
+        return self._embedder.n_embedded
+
+    def identity(self) -> list[Any]:
+        """Nothing: the states are part of the recorded episodes, the views of the scorer."""
+        return []
+
+    def describe(self) -> dict[str, Any]:
+        """Nothing: the scorer tells the views."""
+        return {}
+
+    def embed(self, on_progress: Callable[[int, int], None] | None = None) -> None:
+        """Leave the embeddings of all states in the cache."""
+        self._embedder.embed(np.concatenate(list(self._states)), on_progress)
+
+    def __iter__(self) -> Iterator[EmbeddedEpisode]:
+        return map(self._embedder.embedded, self._states)

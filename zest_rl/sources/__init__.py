@@ -2,6 +2,7 @@
 
 | input | episodes | frames |
 |---|---|---|
+| Minari dataset of zest/Kitchen-v1 | copied | its states, rendered from a ring of views (`kitchen`) |
 | Minari dataset with pictures among its observations | copied | those (`pictures`) |
 | Minari dataset with recorded MuJoCo states, or with `--camera NAME` | copied | rendered from the model (`states`) |
 | any of these with `--frames FOLDER …` | | videos or pictures in a folder (`clips`) |
@@ -18,16 +19,13 @@ from zest_rl.data import reader
 from zest_rl.data.observations import choose_pictures
 from zest_rl.data.writer import Copied, Trajectories
 from zest_rl.errors import BadInput
+from zest_rl.simulation.views import Views
 from zest_rl.sources.base import Frames, Source
+from zest_rl.sources.kitchen import KitchenStates, kitchen_source
 from zest_rl.sources.pictures import Pictures, picture_entries
 from zest_rl.sources.videos import find_clips
 
-__all__ = ["Frames", "Source", "is_kitchen", "open_source"]
-
-
-def is_kitchen(dataset: str) -> bool:
-    """Whether a dataset is of zest/Kitchen-v1, whose frames `zest_rl.rewards.relabel` renders."""
-    return not _is_path(dataset) and reader.kitchen_task(dataset) is not None
+__all__ = ["Frames", "KitchenStates", "Source", "open_source"]
 
 
 def _is_path(dataset: str) -> bool:
@@ -39,7 +37,15 @@ def _is_path(dataset: str) -> bool:
     return path.exists() and not (is_id and reader.exists(dataset))
 
 
-def open_source(dataset: str, *, frames: Sequence[str] = (), cameras: Sequence[str] = ()) -> Source:
+def open_source(
+    dataset: str,
+    *,
+    frames: Sequence[str] = (),
+    cameras: Sequence[str] = (),
+    n_views: int = Views.n_views,
+    show_robot: bool = Views.robot,
+    tolerance: float = Views.tolerance,
+) -> Source:
     """Find a dataset's episodes and their frames.
 
     Args:
@@ -47,10 +53,23 @@ def open_source(dataset: str, *, frames: Sequence[str] = (), cameras: Sequence[s
         frames: entries with pictures, or folders with videos, one per view; empty: the only pictures there are, else
             the recorded states.
         cameras: of the environment's model, one per view, to render the recorded states from.
+        n_views: of the kitchen: cameras around the object.
+        show_robot: of the kitchen: keep the robot in view.
+        tolerance: of the kitchen: states that agree to this many rad or m are one.
 
     Raises:
         BadInput: no such dataset, or its frames cannot be found or told apart; the message says what there is.
     """
+    if not (frames or cameras or _is_path(dataset)) and (task := reader.kitchen_task(dataset)) is not None:
+        return kitchen_source(dataset, Views(task, n_views, robot=show_robot, tolerance=tolerance))
+    rendering = {
+        "--views": n_views != Views.n_views,
+        "--show-robot": show_robot != Views.robot,
+        "--tolerance": tolerance != Views.tolerance,
+    }
+    if any(rendering.values()):
+        flags = " and ".join(flag for flag, given in rendering.items() if given)
+        raise BadInput(f"{flags} belong to the kitchen's own renderer, not to frames from elsewhere; leave them out")
     if frames and cameras:
         raise BadInput("--camera renders recorded states, --frames says where pictures are; give one of them")
     folders = [Path(one).expanduser().resolve() for one in frames if Path(one).expanduser().is_dir()]

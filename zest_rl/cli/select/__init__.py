@@ -113,7 +113,7 @@ def run(config: Arguments | footage.FootageArguments, ui: Ui) -> dict[str, Any]:
             f"{config.top} could not all; give more --n-frames, a smaller --top, or a dataset with more successes"
         )
     views = Views(task.name, config.views, robot=config.show_robot, tolerance=config.tolerance)
-    scorer = ScorerConfig(views, config.goal, config.embedder, config.features, config.similarity, config.precision)
+    scorer = ScorerConfig(config.goal, config.embedder, config.features, config.similarity, config.precision)
     if isinstance(config, GoalArguments) and config.context == "different" and candidates.start_alike(views):
         ui.warn("all trajectories start with the same picture, so x_0 of another one changes nothing; try --show-robot")
     drawn = config.n_goals is not None or (isinstance(config, GoalArguments) and config.context == "different")
@@ -122,9 +122,11 @@ def run(config: Arguments | footage.FootageArguments, ui: Ui) -> dict[str, Any]:
     }  # fmt: skip
     with progress_in_parts(ui, "rendering and embedding") as on_progress:
         if isinstance(config, GoalArguments):
-            scores = score_as_goals(candidates, scorer, context=config.context, on_progress=on_progress, **options)
+            scores = score_as_goals(
+                candidates, scorer, views, context=config.context, on_progress=on_progress, **options
+            )
         else:
-            scores = score_as_actions(candidates, scorer, on_progress=on_progress, **options)
+            scores = score_as_actions(candidates, scorer, views, on_progress=on_progress, **options)
     measures: dict[str, selection.Measure] = {
         "top_n_success": partial(selection.top_up_to, n=config.top),
         "dataset_total_variation": selection.dataset_total_variation,

@@ -1,0 +1,141 @@
+"""A scorer and the embedder of its views: scores of simulator states, recorded or as a rollout meets them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.errors import ZestError
+from zest_rl.rewards.goals import read_kitchen_goal
+from zest_rl.rewards.scorer import Scorer, ScorerConfig
+from zest_rl.rewards.state_embeddings import EmbedConfig, StateEmbedder, StateEmbeddings
+from zest_rl.simulation.views import Views, canonical_states
+from zest_rl.types import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class StateScorer:
+    """Scores states of the kitchen, each rendered and embedded once."""
+
+    scorer: Scorer
+    embedder: StateEmbedder
+
+    @classmethod
+    def of(cls, scorer: Scorer, *, device: str = "auto", **options: Any) -> Self:
+        """Open the cache of a scorer's views; `options` as in `StateEmbedder`.
+
+        Raises:
+            ZestError: the scorer is of frames that are not rendered here.
+        """
+        if scorer.views is None:
+            raise ZestError("the frames of this scorer are from elsewhere, so it cannot score states")
+        config = scorer.config
+        return cls(
+            scorer, StateEmbedder(EmbedConfig(scorer.views, config.embedder, config.precision, device), **options)
+        )
+
+    @classmethod
+    def build(
+        cls,
+        config: ScorerConfig,
+        views: Views,
+        scene_qpos: NDArray[np.float64],
+        *,
+        device: str = "auto",
+        **options: Any,
+    ) -> Self:
+        """Read and embed the goal.
+
+        Args:
+            config: what is scored how.
+            views: from where, and of which task.
+            scene_qpos: (nq,) a start state of the scene, for same-scene goals.
+            device: where the embedder runs.
+            options: as in `StateEmbedder`.
+
+        Raises:
+            BadInput: the goal cannot be read, or the embedder does not read its kind.
+        """
+        goal = read_kitchen_goal(config.goal, views, scene_qpos)
+        return cls.of(Scorer.build(config, goal, views=views, device=device), device=device, **options)
+
+    @classmethod
+    def load(cls, path: Path, *, device: str = "auto", **options: Any) -> Self:
+        """Read what `Scorer.save` wrote; raises as `Scorer.load` does."""
+        return cls.of(Scorer.load(path, device=device), device=device, **options)
+
+    def seen_as(self, task: str) -> Self:
+        """Return a scorer with the same goals that sees states from the views of another task."""
+        embedder = self.embedder
+        views = replace(embedder.config.views, task=task)
+        return type(self).of(
+            replace(self.scorer, views=views),
+            device=embedder.config.device,
+            n_workers=embedder.n_workers,
+            engine=embedder.engine,
+        )
+
+    def with_goals(self, kept: NDArray[np.intp]) -> Self:
+        """Return a scorer with the goals of these indices alone; both share what is embedded."""
+        return replace(self, scorer=self.scorer.with_goals(kept))
+
+    def embeddings(self, states: Sequence[NDArray[np.float64]]) -> StateEmbeddings:
+        """Embed whole episodes, (T+1, nq) simulator positions each."""
+        embeddings = StateEmbeddings(self.embedder, states)
+        embeddings.embed()
+        return embeddings
+
+    def score_episode(self, states: NDArray[np.float64]) -> FloatArray:
+        """Score a whole episode: (T+1, nq) → (T+1,) float32."""
+        return self.scorer.score_episodes(self.embeddings([states]))[0][0]
+
+    def by_view(self, states: NDArray[np.float64]) -> FloatArray:
+        """Score one episode by each view alone: (T+1, nq) → (V, T+1) float32."""
+        (episode,) = self.embeddings([states])
+        return self.scorer.by_view(episode)
+
+    def score_now(self, first: NDArray[np.float64], current: NDArray[np.float64]) -> FloatArray:
+        """Score one state of each of N running episodes; `flush` leaves their embeddings in the cache.
+
+        Args:
+            first: (N, nq) their first states.
+            current: (N, nq) their current states.
+
+        Returns:
+            (N,) float32 scores.
+        """
+        scores = np.empty(len(current), dtype=np.float32)
+        _, group = np.unique(canonical_states(first, self.embedder.config.views), axis=0, return_inverse=True)
+        for same in range(group.max() + 1):  # mostly one group: the objects start alike
+            rows = np.flatnonzero(group.reshape(-1) == same)
+            states = np.concatenate([first[rows[:1]], current[rows]])
+            scores[rows] = self.scorer.score(self.embedder.embed_now(states))[1:]
+        return scores
+
+    def score_pairs(
+        self,
+        first: NDArray[np.float64],
+        current: NDArray[np.float64],
+        on_progress: Callable[[int, int], None] | None = None,
+    ) -> FloatArray:
+        """Score many states, each against a start of its own; all cores embed.
+
+        Args:
+            first: (N, nq) their x_0.
+            current: (N, nq).
+            on_progress: called with (parts embedded, parts in all).
+
+        Returns:
+            (N,) float32 scores.
+        """
+        self.embedder.embed(np.concatenate([first, current]), on_progress)
+        return self.score_now(first, current)
+
+    def flush(self) -> None:
+        """Leave what `score_now` embedded in the cache."""
+        self.embedder.flush()

@@ -1,0 +1,51 @@
+"""Recorded states of zest/Kitchen-v1, rendered from a ring of views; with the robot hidden, as in the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.data import reader
+from zest_rl.data.writer import Copied
+from zest_rl.runtime import artifacts
+from zest_rl.simulation.views import Views, canonical_states
+from zest_rl.sources.base import Source
+from zest_rl.types import Frame
+
+
+@dataclass(frozen=True, eq=False)
+class KitchenStates:
+    """`Frames` of the kitchen's states. Equal states have equal frames, so that each need be seen but once."""
+
+    states: Sequence[NDArray[np.float64]]
+    """(T+1, nq) simulator positions of every episode."""
+    ring: Views
+
+    @property
+    def views(self) -> Sequence[str]:
+        """Where each camera stands."""
+        return [f"azimuth {c.azimuth:g}°, elevation {c.elevation:g}°, {c.distance:g} m" for c in self.ring.cameras]
+
+    def describe(self) -> dict[str, Any]:
+        """Tell what was rendered how."""
+        return {"kind": "kitchen", "views": list(self.views), "ring": asdict(self.ring)}
+
+    def digest(self, episode: int) -> str:
+        """Hash the states as they are rendered, and the views."""
+        states = canonical_states(self.states[episode], self.ring)
+        return artifacts.hash_json([artifacts.hash_arrays(states), self.ring.fingerprint()])
+
+    def read(self, episode: int) -> Iterator[Sequence[Frame]]:
+        """Render each state."""
+        renderer = self.ring.shared_renderer()
+        for state in canonical_states(self.states[episode], self.ring):
+            yield list(renderer.render(state))
+
+
+def kitchen_source(dataset_id: str, ring: Views) -> Source:
+    """Open a dataset of the kitchen, to be seen from a ring of views."""
+    return Source(Copied(dataset_id), KitchenStates(reader.read_states(dataset_id), ring))
