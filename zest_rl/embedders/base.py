@@ -1,0 +1,55 @@
+"""What a network is: frozen weights, with the preprocessing that they were trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from PIL import Image
+
+from zest_rl.types import Frame
+
+Preprocess = Callable[[Image.Image], torch.Tensor]
+
+ENTRY_POINTS = "zest_rl.embedders"
+"""Group of the entry points by which another package registers a family: name → function from the URI's rest to a
+`Network`."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """A frozen network with its weights, and how it wants to be fed."""
+
+    module: torch.nn.Module
+    preprocess: Preprocess
+    """RGB image → (3, H, W) float32, the model's own."""
+    encode_images: Callable[[torch.Tensor], torch.Tensor]
+    """(N, 3, H, W) → (N, D), on the module's device and in its dtype."""
+    encode_texts: Callable[[list[str]], torch.Tensor] | None = None
+    """N sentences → (N, D); None when it reads no text."""
+    identity: str = ""
+    """Whatever makes it what it is, besides its weights and what its module and preprocessing print."""
+
+    def __post_init__(self) -> None:
+        self.module.requires_grad_(False).eval()
+
+    def embed_frames(self, frames: Iterable[Frame]) -> torch.Tensor:
+        """(H, W, 3) uint8 frames → (N, D), in one batch."""
+        weight = next(self.module.parameters())
+        pixels = torch.stack([self.preprocess(Image.fromarray(frame)) for frame in frames])
+        return self.encode_images(pixels.to(weight.device, weight.dtype, memory_format=torch.channels_last))
+
+    @cached_property
+    def dim(self) -> int:
+        """Length D of a vector."""
+        with torch.inference_mode():
+            return self.embed_frames([np.zeros((8, 8, 3), np.uint8)]).shape[1]
+
+    def place(self, device: str, dtype: torch.dtype) -> Network:
+        """Move the module, in the memory layout that convolutions like best, and return self."""
+        self.module.to(device=device, dtype=dtype)
+        self.module.to(memory_format=torch.channels_last)
+        return self
