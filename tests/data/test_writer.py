@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from zest_rl.data import reader
-from zest_rl.data.writer import Recording, write_dataset, write_relabeled
+from zest_rl.data.writer import DatasetCopy, Recording, write_dataset, write_scored
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen import collect
 from zest_rl.runtime import artifacts
@@ -62,9 +62,14 @@ def write(recordings: list[Recording], dataset_id: str = NEW, **changes: Any) ->
 
 def relabel(source: str, dataset_id: str = NEW, extra: Any = lambda staging: None) -> Path:
     rewards, scores = new_rewards(source)
-    return write_relabeled(
-        source, dataset_id, rewards, scores, description="And more.", zest={"relabel": {"a": 1}}, extra=extra
+    return write_scored(
+        copy_of(source), dataset_id, rewards, scores, description="And more.", zest={"relabel": {"a": 1}}, extra=extra
     )
+
+
+def copy_of(dataset_id: str) -> DatasetCopy:
+    with reader.open_dataset(dataset_id) as ds:
+        return DatasetCopy.of(ds)
 
 
 def new_rewards(source: str) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -241,8 +246,8 @@ def test_minari_and_this_package_read_the_relabeled_rewards(collected: str) -> N
 def test_relabeling_a_relabeled_dataset_replaces_its_scores(collected: str) -> None:
     relabel(collected)
     zeros = [np.zeros(101, np.float32)] * 4
-    write_relabeled(
-        NEW,
+    write_scored(
+        copy_of(NEW),
         "zest/again-v0",
         [z[1:] for z in zeros],
         zeros,
@@ -267,7 +272,7 @@ def test_relabeling_a_relabeled_dataset_replaces_its_scores(collected: str) -> N
 def test_rewards_that_do_not_fit_are_refused_before_anything_is_made(collected: str, change: Any, rule: str) -> None:
     rewards, scores = change(*new_rewards(collected))
     with pytest.raises(BadInput, match=rule):
-        write_relabeled(collected, NEW, rewards, scores, description="", zest={}, extra=lambda staging: None)
+        write_scored(copy_of(collected), NEW, rewards, scores, description="", zest={}, extra=lambda staging: None)
     assert listed() == {collected}
 
 
@@ -348,7 +353,7 @@ def test_a_read_only_root_is_refused(small_root: Disk) -> None:
 
 WRITE = f"""
 import sys
-from test_data_writer import random_recordings, write
+from test_writer import random_recordings, write
 try:
     write(random_recordings(int(sys.argv[1]), seed=int(sys.argv[2])), description=sys.argv[2])
 except Exception as error:
@@ -404,9 +409,7 @@ def test_a_killed_writer_leaves_no_dataset_and_the_same_call_completes(root: Pat
 
 def test_a_script_needs_no_main_guard(root: Path, tmp_path: Path) -> None:
     script = tmp_path / "script.py"
-    script.write_text(
-        "from test_data_writer import random_recordings, write\nprint('begun')\nwrite(random_recordings(2))\n"
-    )
+    script.write_text("from test_writer import random_recordings, write\nprint('begun')\nwrite(random_recordings(2))\n")
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     command = [sys.executable, str(script)]
     assert subprocess.run(command, env=environment, timeout=60, capture_output=True, text=True).stdout == "begun\n"

@@ -12,9 +12,8 @@ import shutil
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import h5py
 import numpy as np
@@ -25,12 +24,9 @@ from zest_rl.data.reader import (
     MANIFEST_FILE,
     METADATA_FILE,
     SOURCE_REWARD,
+    Dataset,
     dataset_path,
     exists,
-    fingerprint,
-    read_lengths,
-    read_metadata,
-    rewards_to_keep,
 )
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
@@ -251,34 +247,40 @@ class Trajectories(Protocol):
 
 
 @dataclass(frozen=True)
-class Copied:
-    """The `Trajectories` of a Minari dataset, copied as they are."""
+class DatasetCopy:
+    """The `Trajectories` of a Minari dataset, copied as they are; what is read of them was read by `of`."""
 
     dataset_id: str
+    path: Path
+    """Folder of the dataset."""
+    n_steps: Sequence[int]
+    """T of every episode."""
+    sha256: str
+    rewards: Sequence[FloatArray | None]
 
-    @cached_property
-    def n_steps(self) -> Sequence[int]:
-        """T of every episode."""
-        return read_lengths(self.dataset_id)
+    @classmethod
+    def of(cls, ds: Dataset) -> Self:
+        """Read what the new dataset needs to know of a dataset that is open."""
+        return cls(ds.id, ds.path, ds.n_steps(), ds.fingerprint(), ds.rewards_to_keep())
 
     @property
     def n_bytes(self) -> int:
         """Size of the HDF5 file."""
-        return (dataset_path(self.dataset_id) / DATA_FILE).stat().st_size
+        return (self.path / DATA_FILE).stat().st_size
 
     def fingerprint(self) -> str:
-        """See `zest_rl.data.reader.fingerprint`."""
-        return fingerprint(self.dataset_id)
+        """See `zest_rl.data.reader.Dataset.fingerprint`."""
+        return self.sha256
 
     def source_rewards(self) -> Sequence[FloatArray | None]:
-        """See `zest_rl.data.reader.rewards_to_keep`."""
-        return rewards_to_keep(self.dataset_id)
+        """See `zest_rl.data.reader.Dataset.rewards_to_keep`."""
+        return self.rewards
 
     def fill(self, folder: Path) -> None:
         """Copy the two files."""
         (folder / "data").mkdir()
         for name in (DATA_FILE, METADATA_FILE):
-            shutil.copyfile(dataset_path(self.dataset_id) / name, folder / name)
+            shutil.copyfile(self.path / name, folder / name)
 
     def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
         """Nothing: a copy of a file that fails raises."""
@@ -304,21 +306,6 @@ def _scored(reward: FloatArray, score: FloatArray, source: FloatArray | None) ->
     if source is not None and not np.isnan(source).all():
         arrays[SOURCE_REWARD] = np.concatenate([np.zeros(1, np.float32), source])
     return arrays
-
-
-def write_relabeled(
-    source_id: str,
-    dataset_id: str,
-    rewards: Sequence[FloatArray],
-    scores: Sequence[FloatArray],
-    *,
-    description: str,
-    zest: Mapping[str, Any],
-    extra: Callable[[Path], None],
-) -> Path:
-    """Write a copy of a Minari dataset with other rewards: `write_scored` of its trajectories."""
-    read_metadata(source_id)  # its files are whole
-    return write_scored(Copied(source_id), dataset_id, rewards, scores, description=description, zest=zest, extra=extra)
 
 
 def write_scored(

@@ -13,15 +13,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 from zest_rl.data import reader
 from zest_rl.data.observations import choose_pictures
-from zest_rl.data.writer import Copied, Trajectories
+from zest_rl.data.writer import DatasetCopy, Trajectories
 from zest_rl.errors import BadInput
 from zest_rl.simulation.views import Views
 from zest_rl.sources.base import Frames, Source
-from zest_rl.sources.kitchen import KitchenStates, kitchen_source
+from zest_rl.sources.kitchen import KitchenStates, read_kitchen
 from zest_rl.sources.pictures import Pictures, picture_entries
 from zest_rl.sources.videos import find_clips
 
@@ -60,31 +61,34 @@ def open_source(
     Raises:
         BadInput: no such dataset, or its frames cannot be found or told apart; the message says what there is.
     """
-    if not (frames or cameras or _is_path(dataset)) and (task := reader.kitchen_task(dataset)) is not None:
-        return kitchen_source(dataset, Views(task, n_views, robot=show_robot, tolerance=tolerance))
-    rendering = {
-        "--views": n_views != Views.n_views,
-        "--show-robot": show_robot != Views.robot,
-        "--tolerance": tolerance != Views.tolerance,
-    }
-    if any(rendering.values()):
-        flags = " and ".join(flag for flag, given in rendering.items() if given)
-        raise BadInput(f"{flags} belong to the kitchen's own renderer, not to frames from elsewhere; leave them out")
-    if frames and cameras:
-        raise BadInput("--camera renders recorded states, --frames says where pictures are; give one of them")
-    folders = [Path(one).expanduser().resolve() for one in frames if Path(one).expanduser().is_dir()]
-    if folders and len(folders) < len(frames):
-        raise BadInput(f"--frames must be folders or entries of the dataset, not both; got {', '.join(frames)}")
-    keys = [] if folders else frames
-    found: Frames | None
-    trajectories: Trajectories
-    if _is_path(dataset):
-        if cameras:
-            raise BadInput("--camera renders the states of Minari datasets alone; leave it out")
-        trajectories, found = _open_path(Path(dataset).expanduser(), keys, with_frames=not folders)
-    else:
-        trajectories = Copied(dataset)
-        found = None if folders else _minari_frames(dataset, keys, cameras)
+    with nullcontext() if _is_path(dataset) else reader.open_dataset(dataset) as ds:
+        if ds is not None and ds.record.task is not None and not (frames or cameras):
+            return read_kitchen(ds, Views(ds.record.task, n_views, robot=show_robot, tolerance=tolerance))
+        rendering = {
+            "--views": n_views != Views.n_views,
+            "--show-robot": show_robot != Views.robot,
+            "--tolerance": tolerance != Views.tolerance,
+        }
+        if any(rendering.values()):
+            flags = " and ".join(flag for flag, given in rendering.items() if given)
+            raise BadInput(
+                f"{flags} belong to the kitchen's own renderer, not to frames from elsewhere; leave them out"
+            )
+        if frames and cameras:
+            raise BadInput("--camera renders recorded states, --frames says where pictures are; give one of them")
+        folders = [Path(one).expanduser().resolve() for one in frames if Path(one).expanduser().is_dir()]
+        if folders and len(folders) < len(frames):
+            raise BadInput(f"--frames must be folders or entries of the dataset, not both; got {', '.join(frames)}")
+        keys = [] if folders else frames
+        found: Frames | None
+        trajectories: Trajectories
+        if ds is None:
+            if cameras:
+                raise BadInput("--camera renders the states of Minari datasets alone; leave it out")
+            trajectories, found = _open_path(Path(dataset).expanduser(), keys, with_frames=not folders)
+        else:
+            found = None if folders else _minari_frames(ds, keys, cameras)
+            trajectories = DatasetCopy.of(ds)
     if folders:
         found = find_clips(folders, len(trajectories.n_steps), dataset)
     if found is None:
@@ -104,15 +108,13 @@ def _open_path(path: Path, keys: Sequence[str], *, with_frames: bool) -> tuple[T
     return (open_lerobot if path.is_dir() else open_robomimic)(path, keys, with_frames=with_frames)
 
 
-def _minari_frames(dataset: str, keys: Sequence[str], cameras: Sequence[str]) -> Frames:
-    names = reader.episode_names(dataset)
-    file = reader.dataset_path(dataset) / reader.DATA_FILE
-    found = picture_entries(file, f"{names[0]}/observations")
+def _minari_frames(ds: reader.Dataset, keys: Sequence[str], cameras: Sequence[str]) -> Frames:
+    names = list(ds.groups)
+    found = picture_entries(ds.file, f"{names[0]}/observations")
     if cameras or not (keys or any(found.values())):
         from zest_rl.sources.states import find_states
 
-        env_spec = reader.read_metadata(dataset).get("env_spec")
-        return find_states(file, names, env_spec, cameras, f"dataset {dataset}")
-    chosen = choose_pictures(found, keys, f"dataset {dataset}", "observations")
+        return find_states(ds.file, names, ds.record.env_spec, cameras, f"dataset {ds.id}")
+    chosen = choose_pictures(found, keys, f"dataset {ds.id}", "observations")
     views = tuple("/".join(part for part in ("observations", key) if part) for key in chosen)
-    return Pictures(file, tuple(names), views)
+    return Pictures(ds.file, tuple(names), views)

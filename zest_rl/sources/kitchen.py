@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.data import reader
-from zest_rl.data.writer import Copied
+from zest_rl.data.reader import Dataset, open_dataset
+from zest_rl.data.writer import DatasetCopy
 from zest_rl.runtime import artifacts
 from zest_rl.simulation.views import Views, canonical_states
 from zest_rl.sources.base import Source
@@ -47,5 +47,11 @@ class KitchenStates:
 
 
 def kitchen_source(dataset_id: str, ring: Views) -> Source:
-    """Open a dataset of the kitchen, to be seen from a ring of views."""
-    return Source(Copied(dataset_id), KitchenStates(reader.read_states(dataset_id), ring))
+    """Read a dataset of the kitchen, to be seen from a ring of views; raises as `Dataset.states`."""
+    with open_dataset(dataset_id) as ds:
+        return read_kitchen(ds, ring)
+
+
+def read_kitchen(ds: Dataset, ring: Views) -> Source:
+    """Read a dataset that is open; as `kitchen_source`."""
+    return Source(DatasetCopy.of(ds), KitchenStates(ds.states(), ring))
