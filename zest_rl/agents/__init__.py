@@ -1,7 +1,7 @@
 """Algorithms: one file each, in the same order (config, model, batch, loss, act); the registry is a dict.
 
-To add one, copy the file that is nearest to it and add a line to `AGENTS`. `foreign` is none of them: it lets policies
-act that other programs trained.
+To add one, copy the file that is nearest to it and add a line to `AGENTS`. `foreign` is not an algorithm: it runs
+policies that other programs trained.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def load_policy(run_dir: Path, device: str = "cpu") -> Policy:
 
     Raises:
         ZestError: the run is not finished, or its weights are not the ones that ``meta.json`` names.
-        BadInput: its agent is unknown here, or a policy from elsewhere cannot be read.
+        BadInput: its agent is unknown here, or a foreign policy cannot be read.
     """
     meta: dict[str, Any] = read_json(run_dir / "meta.json")
     if meta["agent"] == foreign.FOREIGN:

@@ -1,4 +1,4 @@
-"""What every agent shares: what the data look like, the shape of an agent and of a policy. No algorithm is in here."""
+"""What all agents share: statistics of the data, and the interfaces of agents and policies. No algorithm is here."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ class Policy(Protocol):
     """`begin` needs a target return, and rewards given to `observe` change the actions."""
 
     def begin(self, n_episodes: int, target_return: float | None = None) -> None:
-        """Forget what went before and start N episodes, each asked for `target_return` (in the data's units)."""
+        """Reset and start N episodes, each asked for `target_return` (in the data's units)."""
 
     def act(self, obs: FloatArray) -> FloatArray:
         """Return actions (N, act_dim) float32 in [-1, 1] for obs (N, obs_dim) float32, the newest of each episode."""
@@ -185,7 +185,7 @@ class Policy(Protocol):
         """Take the rewards (N,) of the last actions off the returns still asked for."""
 
     def end(self) -> dict[str, NDArray[Any]]:
-        """Let go of what the episodes needed, be it after a failure; return what there is to tell, arrays (N, …)."""
+        """Release per-episode resources, even after a failure; return further results by name, arrays (N, …)."""
 
 
 def check_obs(obs: FloatArray, n_episodes: int, obs_dim: int) -> None:

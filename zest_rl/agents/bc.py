@@ -156,7 +156,7 @@ class BCPolicy:
         """Rewards change nothing here."""
 
     def end(self) -> dict[str, NDArray[Any]]:
-        """Nothing is held, and nothing is told."""
+        """There is nothing to release or to return."""
         return {}
 
 

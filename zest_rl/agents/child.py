@@ -1,4 +1,4 @@
-"""A policy in a process of its own, which may be another Python or no Python at all: lines of JSON over its pipes.
+"""A policy in a process of its own, in another Python or another language: lines of JSON over its pipes.
 
 Each line that it reads on stdin is answered by one line on stdout; ``docs/foreign_policies.md`` has an example::
 
@@ -33,7 +33,7 @@ TIMEOUT_VARIABLE, TIMEOUT = "ZEST_POLICY_TIMEOUT", 120.0
 GRACE = 5.0
 """Seconds between the end of stdin and the process being killed."""
 MAX_ANSWER = 2**24  # bytes: a line that does not end is no answer
-# The kernel ends the child with us even if we are killed: a hanging child would not notice that its stdin has ended.
+# The kernel ends the process with ours even if we are killed: a hanging process would not notice that stdin has ended.
 _START = """
 import ctypes, os, signal, sys
 if sys.platform == "linux":
@@ -43,8 +43,8 @@ if os.getppid() == int(sys.argv[1]):
 """
 
 
-class Child:
-    """A command that acts; it is started by `begin` and gone after `end`."""
+class PolicyProcess:
+    """A command that acts; `begin` starts its process and `end` ends it."""
 
     def __init__(self, words: Sequence[str], obs_dim: int, act_dim: int):
         """Take the command's words.
@@ -53,7 +53,7 @@ class Child:
             BadInput: there is no such program, or the timeout in the environment is no number.
         """
         if shutil.which(words[0]) is None:
-            raise BadInput(f"there is no program {words[0]!r} to be run; give its path, or mend PATH")
+            raise BadInput(f"there is no program {words[0]!r} to be run; give its path, or fix PATH")
         try:
             self._timeout = float(os.environ.get(TIMEOUT_VARIABLE, TIMEOUT))
         except ValueError as error:
@@ -75,7 +75,7 @@ class Child:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
-            env={**os.environ, **dict.fromkeys(THREAD_VARIABLES, "1")},  # results do not depend on who else computes
+            env={**os.environ, **dict.fromkeys(THREAD_VARIABLES, "1")},  # results must not depend on the machine's load
             start_new_session=True,  # a group of its own, to be killed as a whole
         )
         self._ask({"begin": {"n_episodes": n_episodes, **self._dims}}, "ready")
@@ -89,11 +89,11 @@ class Child:
         return self._ask({"obs": obs.tolist()}, "actions")
 
     def end(self) -> None:
-        """Close the process's stdin and wait for its end; kill it when that does not come."""
+        """Close the process's stdin and wait for it to exit; kill it if it does not."""
         process, self._process = self._process, None
         if process is None or process.stdin is None or process.stdout is None or self._errors is None:
             return
-        with suppress(OSError):  # what was written last may have no reader any more
+        with suppress(OSError):  # the process may be gone before it read the last line
             process.stdin.close()
         with suppress(subprocess.TimeoutExpired):
             process.wait(GRACE)
@@ -107,11 +107,11 @@ class Child:
         assert process is not None
         assert process.stdin is not None
         assert process.stdout is not None
-        late = threading.Event()
+        timed_out = threading.Event()
 
         def give_up() -> None:
-            late.set()
-            _kill(process)  # what waits for its pipes, below, goes on
+            timed_out.set()
+            _kill(process)  # ends the wait for its pipes below
 
         timer = threading.Timer(self._timeout, give_up)
         timer.start()
@@ -123,27 +123,27 @@ class Child:
             line = b""
         finally:
             timer.cancel()
-        if late.is_set():
+        if timed_out.is_set():
             raise ZestError(
                 f"the policy's process gave no answer within {self._timeout:g} s and was killed; it must answer "
                 "each line of stdin by one line on stdout, and flush it. If it only needs longer, set "
-                f"{TIMEOUT_VARIABLE} (seconds){self._last_words()}"
+                f"{TIMEOUT_VARIABLE} (seconds){self._stderr_tail()}"
             )
         if not line:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(GRACE)
             code = process.poll()
             how = "closed its stdout" if code is None else f"ended with exit code {code}"
-            raise ZestError(f"the policy's process {how} instead of answering{self._last_words()}")
+            raise ZestError(f"the policy's process {how} instead of answering{self._stderr_tail()}")
         try:
             return json.loads(line)[key]
         except (ValueError, TypeError, KeyError):
             raise ZestError(
                 f'the policy\'s process must answer one line {{"{key}": …}} of JSON, got {line[:80]!r}; let it print '
-                f"everything else to stderr{self._last_words()}"
+                f"everything else to stderr{self._stderr_tail()}"
             ) from None
 
-    def _last_words(self) -> str:
+    def _stderr_tail(self) -> str:
         """Return the end of what the process wrote to stderr, for a message."""
         assert self._errors is not None
         size = self._errors.seek(0, os.SEEK_END)

@@ -240,7 +240,7 @@ class DTPolicy:
         self._window: deque[dict[str, FloatArray]] = deque(maxlen=self._config.context_len)
 
     def begin(self, n_episodes: int, target_return: float | None = None) -> None:
-        """Forget what went before and start N episodes.
+        """Reset and start N episodes.
 
         Raises:
             BadInput: the model is conditioned on returns and `target_return` is not a finite number.
@@ -291,7 +291,7 @@ class DTPolicy:
         self._remaining = self._remaining - rewards
 
     def end(self) -> dict[str, NDArray[Any]]:
-        """Nothing is held, and nothing is told."""
+        """There is nothing to release or to return."""
         return {}
 
 

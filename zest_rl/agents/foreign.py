@@ -1,4 +1,4 @@
-"""Policies that other programs trained, at work like our own.
+"""Policies that other programs trained; they act like those that are trained here.
 
 | spec | what acts |
 |---|---|
@@ -26,48 +26,55 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from zest_rl.agents.base import check_obs
-from zest_rl.agents.child import Child
+from zest_rl.agents.child import PolicyProcess
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime.artifacts import hash_file
 from zest_rl.types import FloatArray
 
 FOREIGN = "foreign"
-"""What stands in the place of an agent in the meta of such a run."""
+"""Name of the agent in the ``meta.json`` of such a run."""
 ENTRY_POINTS = "zest_rl.policies"
 FAMILIES = ("torchscript", "onnx", "d3rlpy", "command")
-FOLDER = "policy"
-"""Of a run, where the files of the policy are."""
-TOLERANCE = 1e-5  # beyond the bounds of an action, before it counts as clipped
+POLICY_FOLDER = "policy"
+"""Folder of a run that holds copies of the policy's files."""
+TOLERANCE = 1e-5
+"""An action may leave [-1, 1] by this much before it counts as clipped."""
 
 Act = Callable[[FloatArray], Any]
 
 
-# ------------------------------------------------------------------------------------------------------------ what
+# -------------------------------------------------------------------------------------------------------- identity
 
 
 @dataclass(frozen=True)
-class Source:
-    """What acts, told apart by content."""
+class PolicyIdentity:
+    """Which policy acts; policies with equal files have equal identities, whatever their paths."""
 
     family: str
+    """One of `FAMILIES`, or a name that another package registered."""
     words: tuple[str, ...]
     """A file of the run (``policy/FILE``), the words of a command, or what stands after ``NAME:``."""
     files: Mapping[str, str]
-    """Path (from the run's folder, or absolute) → sha256, of all files that it is known to consist of."""
+    """Path (from the run's folder, or absolute) → sha256, of all files that the policy is known to consist of."""
     code: str = ""
     """Entry point and version of what another package registered."""
     originals: Mapping[str, Path] = field(default_factory=dict)
     """Path in the run's folder → the file to be copied there."""
 
-    def described(self) -> dict[str, Any]:
-        """JSON-ready, for the meta of the run."""
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
+        """Read what `to_json` returned."""
+        return cls(**{**values, "words": tuple(values["words"])})
+
+    def to_json(self) -> dict[str, Any]:
+        """What the run's ``meta.json`` holds as ``policy``."""
         return {"family": self.family, "words": list(self.words), "files": dict(self.files), "code": self.code}
 
 
@@ -91,8 +98,8 @@ def parse(spec: str, python: str | None = None) -> tuple[str, str]:
     return family, rest
 
 
-def identify(spec: str, python: str | None = None) -> Source:
-    """Find what a spec (see the table above) is about, and hash its files; nothing is run.
+def identify(spec: str, python: str | None = None) -> PolicyIdentity:
+    """Find which policy a spec (see the table above) names, and hash its files; nothing is run.
 
     Args:
         spec: the policy.
@@ -104,23 +111,23 @@ def identify(spec: str, python: str | None = None) -> Source:
     family, rest = parse(spec, python)
     if family == "command":
         words = tuple(_absolute(word) for word in _split(rest))
-        return Source(family, words, _files_of(words))
+        return PolicyIdentity(family, words, _hash_files(words))
     if family not in FAMILIES:
         entry = _registered()[family]
         word = _absolute(rest)
-        files = _files_of([word])
+        files = _hash_files([word])
         version = entry.dist.version if entry.dist is not None else "unknown"
-        return Source(family, (word,), files, code=f"{entry.value} {version}")
+        return PolicyIdentity(family, (word,), files, code=f"{entry.value} {version}")
     path = Path(rest).expanduser()
     if not path.is_file():
         raise BadInput(f"there is no file {path}; give what the training program saved")
     weights = path.with_name(f"{path.name}.data")  # where torch's exporter puts what an ONNX file refers to
     parts = [path, weights] if family == "onnx" and weights.is_file() else [path]
-    originals = {f"{FOLDER}/{part.name}": part for part in parts}
-    runner = () if python is None else (_program(python),)
-    return Source(
+    originals = {f"{POLICY_FOLDER}/{part.name}": part for part in parts}
+    program = () if python is None else (_find_program(python),)
+    return PolicyIdentity(
         family,
-        (*runner, f"{FOLDER}/{path.name}"),
+        (*program, f"{POLICY_FOLDER}/{path.name}"),
         {place: hash_file(part) for place, part in originals.items()},
         originals=originals,
     )
@@ -130,32 +137,32 @@ def _registered() -> dict[str, importlib.metadata.EntryPoint]:
     return {entry.name: entry for entry in importlib.metadata.entry_points(group=ENTRY_POINTS)}
 
 
-def _path_in(word: str) -> tuple[str, Path | None]:
-    """Return what stands before the path in ``--flag=PATH``, and the path; None when there is none."""
+def _split_path(word: str) -> tuple[str, Path | None]:
+    """Split ``--flag=PATH`` into ``--flag=`` and the absolute path; None when the word names no file or folder."""
     flag, equals, value = word.rpartition("=") if word.startswith("-") else ("", "", word)
     try:
         path = Path(value).expanduser()
         is_path = path.is_file() or (path.is_dir() and "/" in value)  # a plain word may be a sub-command
         return flag + equals, path.absolute() if is_path else None  # not resolved: a venv's python is a link
-    except (OSError, RuntimeError):  # a name that is too long, or of nobody's home
+    except (OSError, RuntimeError):  # a name that is too long, or the home of an unknown user
         return "", None
 
 
 def _absolute(word: str) -> str:
-    """Name a file or folder so that it is found from everywhere; leave other words alone."""
-    before, path = _path_in(word)
-    return word if path is None else f"{before}{path}"
+    """Make the path in a word absolute; leave other words alone."""
+    flag, path = _split_path(word)
+    return word if path is None else f"{flag}{path}"
 
 
-def _files_of(words: Sequence[str]) -> dict[str, str]:
-    """Hash the files that words name.
+def _hash_files(words: Sequence[str]) -> dict[str, str]:
+    """Hash the files that the words of a command name.
 
     Raises:
-        BadInput: a word names a folder, of which nobody can tell what belongs to the policy.
+        BadInput: a word names a folder, which does not tell what in it belongs to the policy.
     """
     files = {}
     for word in words:
-        _, path = _path_in(word)
+        _, path = _split_path(word)
         if path is not None and path.is_dir():
             raise BadInput(f"{path} is a folder; name the files that the policy consists of, so that they are hashed")
         if path is not None:
@@ -170,18 +177,18 @@ def _split(command: str) -> list[str]:
         raise BadInput(f"the command {command!r} cannot be read as a shell would: {error}") from error
 
 
-def _program(python: str) -> str:
-    found = shutil.which(Path(python).expanduser())
-    if found is None:
+def _find_program(python: str) -> str:
+    program = shutil.which(Path(python).expanduser())
+    if program is None:
         raise BadInput(f"there is no program {python!r}; give --python /path/to/bin/python, which has d3rlpy")
-    return str(Path(found).absolute())
+    return str(Path(program).absolute())
 
 
 # ------------------------------------------------------------------------------------------------------------- act
 
 
 class ForeignPolicy:
-    """Somebody else's policy; it is asked for no return, and what it gives is checked."""
+    """A policy that another program trained; it is asked for no return, and its actions are checked."""
 
     agent = FOREIGN
     uses_return = False
@@ -198,7 +205,7 @@ class ForeignPolicy:
             ZestError: the policy fails.
         """
         self._n_clipped = np.zeros(n_episodes, dtype=np.int64)
-        with self._named("begin"):
+        with self._naming_the_policy("begin"):
             _call(self._act, "begin", n_episodes)
 
     def act(self, obs: FloatArray) -> FloatArray:
@@ -208,7 +215,7 @@ class ForeignPolicy:
             ZestError: the policy fails, or what it gives has another shape, or is not finite.
         """
         check_obs(obs, len(self._n_clipped), self.meta["obs_dim"])
-        with self._named(f"obs of shape {obs.shape}"):
+        with self._naming_the_policy(f"obs of shape {obs.shape}"):
             actions: FloatArray = np.asarray(self._act(obs), dtype=np.float32)
         wanted = (len(obs), self.meta["act_dim"])
         if actions.shape != wanted:
@@ -230,7 +237,7 @@ class ForeignPolicy:
 
     def end(self) -> dict[str, NDArray[Any]]:
         """End the policy's process, if it has one; return ``clipped`` (N,), the number of actions beyond [-1, 1]."""
-        with self._named("end"):
+        with self._naming_the_policy("end"):
             _call(self._act, "end")
         return {"clipped": self._n_clipped}
 
@@ -239,8 +246,8 @@ class ForeignPolicy:
         return f"policy {self.meta['name']!r} ({self.meta['policy']['family']})"
 
     @contextmanager
-    def _named(self, doing: str) -> Iterator[None]:
-        """Say whose failure it is, whatever the other program raises."""
+    def _naming_the_policy(self, doing: str) -> Iterator[None]:
+        """Turn whatever the other program raises into a `ZestError` that names the policy."""
         try:
             yield
         except ZestError as error:
@@ -251,9 +258,10 @@ class ForeignPolicy:
 
 
 def _call(policy: Act, method: str, *arguments: Any) -> None:
-    """Call a method that a policy may have."""
-    if callable(found := getattr(policy, method, None)):
-        found(*arguments)
+    """Call a method that not every policy has."""
+    bound = getattr(policy, method, None)
+    if callable(bound):
+        bound(*arguments)
 
 
 def load(run_dir: Path, meta: dict[str, Any], device: torch.device) -> ForeignPolicy:
@@ -263,31 +271,31 @@ def load(run_dir: Path, meta: dict[str, Any], device: torch.device) -> ForeignPo
         BadInput: a file cannot be read, or its family is not known here.
         ZestError: a file is missing or was changed, or what reads it is not installed.
     """
-    source = Source(**{**meta["policy"], "words": tuple(meta["policy"]["words"])})
-    for name, sha256 in source.files.items():
+    identity = PolicyIdentity.from_json(meta["policy"])
+    for name, sha256 in identity.files.items():
         path = run_dir / name
         if not path.is_file() or hash_file(path) != sha256:
             raise ZestError(
                 f"{path} is missing or was changed since `zest adopt` saw it, which makes it another policy; restore "
                 "it, or adopt the new one"
             )
-    here = {name: str(run_dir / name) for name in source.files}  # a path that is absolute stays as it is
-    words = [here.get(word, word) for word in source.words]
-    if source.family == "torchscript":
+    paths = {name: str(run_dir / name) for name in identity.files}  # a path that is absolute stays as it is
+    words = [paths.get(word, word) for word in identity.words]
+    if identity.family == "torchscript":
         return ForeignPolicy(_read_torchscript(Path(words[0]), device), meta)
-    if source.family == "onnx":
+    if identity.family == "onnx":
         return ForeignPolicy(_read_onnx(Path(words[0])), meta)
-    if source.family in FAMILIES:
-        if source.family == "d3rlpy":
+    if identity.family in FAMILIES:
+        if identity.family == "d3rlpy":
             words.insert(1, str(Path(__file__).with_name("serve_d3rlpy.py")))
-        return ForeignPolicy(Child(words, meta["obs_dim"], meta["act_dim"]), meta)
-    return ForeignPolicy(_build_registered(source), meta)
+        return ForeignPolicy(PolicyProcess(words, meta["obs_dim"], meta["act_dim"]), meta)
+    return ForeignPolicy(_build_registered(identity), meta)
 
 
 def _read_torchscript(path: Path, device: torch.device) -> Act:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)  # torch would rather have another format, but this is used
+            warnings.simplefilter("ignore", FutureWarning)  # torch recommends another format, but this is used
             module = torch.jit.load(str(path), map_location=device).eval()  # type: ignore[no-untyped-call]
     except (RuntimeError, ValueError) as error:
         raise BadInput(
@@ -328,8 +336,8 @@ def _read_onnx(path: Path) -> Act:
     inputs = session.get_inputs()
     if len(inputs) != 1:
         raise BadInput(
-            f"an ONNX policy must have one input, the observations, got {', '.join(one.name for one in inputs)}; serve "
-            "others by command:"
+            f"an ONNX policy must have one input, the observations, got {', '.join(node.name for node in inputs)}; "
+            "serve others by command:"
         )
     run = partial(_run_onnx, session, inputs[0].name)
     return run if inputs[0].shape[:1] != [1] else lambda obs: np.concatenate([run(row[None]) for row in obs])
@@ -340,19 +348,19 @@ def _run_onnx(session: Any, name: str, obs: FloatArray) -> NDArray[Any]:
     return actions
 
 
-def _build_registered(source: Source) -> Act:
-    """Return what a function of somebody else's package makes of the rest of the spec."""
-    entry = _registered().get(source.family)
+def _build_registered(identity: PolicyIdentity) -> Act:
+    """Return what the registered function of another package makes of the rest of the spec."""
+    entry = _registered().get(identity.family)
     if entry is None:
         raise BadInput(
-            f"no installed package registers policies {source.family}:, as {source.code} did when this one was "
+            f"no installed package registers policies {identity.family}:, as {identity.code} did when this one was "
             "adopted; install it again"
         )
     who = f"{entry.value}, which is registered for {entry.name}:,"
     try:
-        act = entry.load()(source.words[0])
+        act = entry.load()(identity.words[0])
     except Exception as error:
-        raise ZestError(f"{who} failed on {source.words[0]!r} ({type(error).__name__}: {error})") from error
+        raise ZestError(f"{who} failed on {identity.words[0]!r} ({type(error).__name__}: {error})") from error
     if not callable(act):
         raise ZestError(f"{who} must return a callable from obs to actions, got {type(act).__name__}")
     built: Act = act

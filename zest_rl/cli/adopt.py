@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,37 +36,22 @@ class Config:
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Hash, copy, try."""
-    from zest_rl.agents.foreign import identify
-    from zest_rl.data import reader
-    from zest_rl.rewards.relabel import SCORER_FILE
     from zest_rl.runtime import artifacts
     from zest_rl.training.adoption import adopt
 
-    source = identify(config.policy, config.python)
-    name = config.name if config.name is not None else f"{_stem(source.words[-1])} ({source.family})"
-    described = reader.describe(config.dataset)
-    slug = re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")
-    digest = artifacts.hash_json([source.described(), name, described])[:8]
-    default = Path("runs") / f"{config.dataset.split('/')[-1]}-{slug}-seed{config.seed}-{digest}"
-    run_dir = config.run_dir or default
-    ui.say(f"trying {config.policy} and copying it to {run_dir}")
-    scorer = reader.dataset_path(config.dataset) / SCORER_FILE
-    adopt(
-        source,
-        name,
-        reader.read_episodes(config.dataset),
-        run_dir,
+    run_dir = adopt(
+        config.policy,
+        config.dataset,
+        name=config.name,
         seed=config.seed,
-        meta={"dataset": described},
-        files={SCORER_FILE: scorer.read_bytes()} if scorer.exists() else {},
+        python=config.python,
+        run_dir=config.run_dir,
+        on_start=lambda folder: ui.say(f"trying {config.policy} and copying it to {folder}"),
     )
+    meta = artifacts.read_json(run_dir / "meta.json")
     return {
         "run": str(run_dir),
-        "name": name,
-        "files": dict(source.files),
+        "name": meta["name"],
+        "files": meta["policy"]["files"],
         "next": f"zest evaluate {shlex.quote(str(run_dir))}",
     }
-
-
-def _stem(word: str) -> str:
-    return Path(word).stem or word

@@ -1,16 +1,17 @@
-"""Policies that other programs trained → run folders, evaluated and compared like those of `zest_rl.training.loop`.
+"""Policies that other programs trained → run folders, evaluated and compared like those of `zest_rl.training.runs`.
 
-A folder has the policy's own files under ``policy/`` (those that are one: a command's stay where they are), and a
-``meta.json`` with the keys of a training's that do not depend on how it was trained, and these::
+A folder has copies of the policy's files under ``policy/`` (a command's files stay where they are), and a ``meta.json``
+with the keys of a training's that do not depend on how it was trained, and these::
 
     name        row of tables
-    policy      family, words and files with their sha256: see `zest_rl.agents.foreign.Source`
+    policy      family, words and files with their sha256: see `zest_rl.agents.foreign.PolicyIdentity`
 """
 
 from __future__ import annotations
 
+import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,10 @@ import torch
 
 from zest_rl.agents import foreign
 from zest_rl.agents.base import describe_data
+from zest_rl.data.reader import open_dataset
 from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
+from zest_rl.training.runs import default_run_dir, scorer_files
 from zest_rl.types import Episode
 
 N_TRIED = 8
@@ -28,32 +31,47 @@ N_TRIED = 8
 
 
 def adopt(
-    source: foreign.Source,
-    name: str,
-    episodes: Sequence[Episode],
-    run_dir: Path,
+    policy: str,
+    dataset_id: str,
     *,
-    seed: int,
-    meta: Mapping[str, Any],
-    files: Mapping[str, bytes],
+    name: str | None = None,
+    seed: int = 0,
+    python: str | None = None,
+    run_dir: Path | None = None,
+    on_start: Callable[[Path], None] | None = None,
 ) -> Path:
-    """Try a policy, and make the run folder of it; return `run_dir`. A folder that holds it already is left as it is.
+    """Try a policy, and make a run folder of it; a folder that holds it already is left as it is.
 
     Args:
-        source: the policy.
-        name: row of tables; policies with equal names are one method, one for each training seed.
-        episodes: the data that it was trained on; it is tried on observations of some.
-        run_dir: folder of this run alone.
+        policy: what acts, as the table of `zest_rl.agents.foreign` lists.
+        dataset_id: Minari dataset that it was trained on; it is tried on some of its observations.
+        name: row of tables; default the file's name and the family. Policies with equal names are one method, one for
+            each training seed.
         seed: that it was trained with.
-        meta: facts about the data (JSON), as for `zest_rl.training.loop.train`.
-        files: name → content of what else the folder holds.
+        python: for ``d3rlpy:``, the Python that has d3rlpy.
+        run_dir: folder of this run alone; default runs/DATASET-NAME-seedN-HASH, where a changed file has another HASH.
+        on_start: called with the run folder before the policy is tried.
+
+    Returns:
+        The run's folder. It holds the dataset's scorer, if the dataset has one.
 
     Raises:
-        BadInput: the policy cannot be read, the name is empty, or the folder holds something else.
+        BadInput: there is no such policy or dataset, the name is empty, or the folder holds something else.
         ZestError: the policy fails, or its actions are not what they must be. No folder is left then.
     """
+    identity = foreign.identify(policy, python)
+    if name is None:
+        name = f"{Path(identity.words[-1]).stem or identity.words[-1]} ({identity.family})"
     if not name.strip() or seed < 0:
         raise BadInput(f"a policy needs a name and a seed of at least 0, got {name!r} and {seed}")
+    with open_dataset(dataset_id) as dataset:
+        episodes, described, files = dataset.episodes(), dataset.describe(), scorer_files(dataset)
+    if run_dir is None:
+        slug = re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")
+        digest = artifacts.hash_json([identity.to_json(), name, described])[:8]
+        run_dir = Path(f"{default_run_dir(slug, dataset_id, seed)}-{digest}")
+    if on_start is not None:
+        on_start(run_dir)
     facts = describe_data(episodes)
     request: dict[str, Any] = {
         "agent": foreign.FOREIGN,
@@ -61,11 +79,11 @@ def adopt(
         "config": {},
         "n_updates": None,
         "seed": seed,
-        "policy": source.described(),
+        "policy": identity.to_json(),
         "obs_dim": facts.obs_dim,
         "act_dim": facts.act_dim,
         "data_sha256": artifacts.hash_arrays(*(a for e in episodes for a in (e.obs, e.actions, e.rewards))),
-        **meta,
+        "dataset": described,
     }
     with artifacts.lock(run_dir):
         if (run_dir / "meta.json").exists():
@@ -77,7 +95,7 @@ def adopt(
         if run_dir.exists() and any(run_dir.iterdir()):
             raise BadInput(f"{run_dir} is not empty and holds no policy; choose another folder")
         with artifacts.staged_folder(run_dir) as staging:
-            for place, original in source.originals.items():
+            for place, original in identity.originals.items():
                 (staging / place).parent.mkdir(exist_ok=True)
                 shutil.copyfile(original, staging / place)
             for file, content in files.items():

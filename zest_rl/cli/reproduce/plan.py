@@ -309,7 +309,7 @@ def plan_cells(plan: Plan, datasets: Mapping[str, TaskData], output: Path) -> li
         arguments = asdict(load_config(config_of(agent), table, name))  # defaults are arguments, too
         if method.entry.policy is not None:
             try:
-                arguments |= {"policy": identify(arguments["policy"], arguments["python"]).described()}
+                arguments |= {"policy": identify(arguments["policy"], arguments["python"]).to_json()}
             except BadInput as error:
                 problems.append(f"{name!r}, trained on {dataset} with seed {seed}: {error}")
         digest = artifacts.hash_json([arguments, agent, described[dataset]])
