@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from zest_rl.data import reader
 from zest_rl.data.writer import write_dataset
 from zest_rl.kitchen import collect
+from zest_rl.kitchen.views import Views, distinct_states
 from zest_rl.rewards import state_embeddings
 from zest_rl.rewards.relabel import relabel_source
 from zest_rl.rewards.scorer import ScorerConfig
@@ -32,9 +33,8 @@ from zest_rl.rewards.state_embeddings import STATES_PER_SHARD, EmbedConfig, Stat
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import concatenate, write_arrays
+from zest_rl.runtime.gl import select_gl_backend
 from zest_rl.runtime.parallel import chunks, one_thread
-from zest_rl.simulation.rendering import select_gl_backend
-from zest_rl.simulation.views import Views, distinct_states
 from zest_rl.sources.kitchen import kitchen_source
 
 REQUIRED_RATIO = 25.0

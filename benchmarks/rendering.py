@@ -1,4 +1,4 @@
-"""CPU time per 224x224 kitchen frame: `zest_rl.simulation.rendering` against ``env.render()`` of gymnasium-robotics.
+"""CPU time per 224x224 kitchen frame: `zest_rl.kitchen.scene` against ``env.render()`` of gymnasium-robotics.
 
 Both draw on the same machine, in the same process, with the same GL backend. The clock is the processor time of all
 threads of the process, because software GL may spread a frame over several cores.
@@ -13,8 +13,9 @@ import gymnasium_robotics
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.kitchen.scene import N_QPOS, RenderConfig, open_renderer, task_cameras
 from zest_rl.kitchen.tasks import TASKS
-from zest_rl.simulation.rendering import N_QPOS, RenderConfig, StateRenderer, ring, select_gl_backend
+from zest_rl.runtime.gl import select_gl_backend
 
 SIZE = 224
 REQUIRED_RATIO = 40.0
@@ -43,8 +44,8 @@ def peer_ms() -> tuple[float, NDArray[np.float64]]:
 
 def ours_ms(config: RenderConfig, states: NDArray[np.float64]) -> float:
     """Return cpu-ms per frame over all tasks' cameras: 24 views of each state (S, 30), with the objects moving."""
-    cameras = tuple(camera for task in TASKS.values() for camera in ring(task, 4))
-    with StateRenderer(config, cameras) as renderer:
+    cameras = tuple(camera for task in TASKS.values() for camera in task_cameras(task, 4))
+    with open_renderer(config, cameras) as renderer:
         renderer.render(np.zeros(N_QPOS))
         start = time.process_time()
         for state in states:

@@ -84,9 +84,9 @@ def trained_root(collected_root: Path, tmp_path_factory: pytest.TempPathFactory)
     are evaluated for `SHORT_HORIZON` steps.
     """
     from zest_rl.agents import AGENTS
+    from zest_rl.kitchen.views import Views
     from zest_rl.rewards.relabel import relabel_source
     from zest_rl.rewards.scorer import ScorerConfig
-    from zest_rl.simulation.views import Views
     from zest_rl.sources.kitchen import kitchen_source
     from zest_rl.training.loop import TrainingConfig
     from zest_rl.training.runs import train
@@ -123,7 +123,7 @@ def trained(trained_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 @pytest.fixture(scope="module")
 def short_videos() -> Iterator[None]:
     """Write the first 2 states of a video only."""
-    from zest_rl.simulation import videos
+    from zest_rl.kitchen import videos
 
     write_video = videos.write_video
 

@@ -31,8 +31,8 @@ from zest_rl.embedders import load_embedder
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.env import KitchenEnv
 from zest_rl.kitchen.tasks import TASKS
+from zest_rl.kitchen.views import Views
 from zest_rl.rewards.scores import score_delta
-from zest_rl.simulation.views import Views
 
 N = 12
 THINGS = {"oven": "micro", "drawer": "sdoor"}
@@ -47,7 +47,7 @@ def openings() -> dict[str, list[list[np.ndarray]]]:
     for thing, name in THINGS.items():
         task = TASKS[name]
         with Views(name, n_views=3, size=64).renderer() as renderer:
-            states = [renderer.with_joint(start, task.joint, share * task.goal) for share in np.linspace(0, 1, N)]
+            states = [renderer.scene.with_joint(start, task.joint, share * task.goal) for share in np.linspace(0, 1, N)]
             frames = np.stack([renderer.render(state) for state in states])
         clips[thing] = [list(frames[:, view]) for view in range(3)]
     return clips

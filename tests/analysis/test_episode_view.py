@@ -7,10 +7,10 @@ import pytest
 
 from zest_rl.analysis.episode_view import N_FRAMES, Look
 from zest_rl.data import reader
+from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.rewards.scorer import ScorerConfig
 from zest_rl.rewards.scores import Features
 from zest_rl.rewards.state_scorer import StateScorer
-from zest_rl.simulation.views import Views, canonical_states
 
 VIEWS = Views("micro", n_views=2, size=96, tolerance=0.05)
 

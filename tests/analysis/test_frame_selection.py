@@ -14,9 +14,9 @@ from zest_rl.analysis.frame_selection import Candidates, draw_candidates, score_
 from zest_rl.data import reader
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.tasks import TASKS
+from zest_rl.kitchen.views import Views
 from zest_rl.rewards.scorer import ScorerConfig
 from zest_rl.rewards.state_scorer import StateScorer
-from zest_rl.simulation.views import Views
 
 VIEWS = Views("micro", n_views=1, size=96, tolerance=0.05)
 CONFIG = ScorerConfig("same-scene")

@@ -17,13 +17,13 @@ from zest_rl.analysis.cross_task import Confusion, confusion, confusion_warnings
 from zest_rl.analysis.inspection import FIGURES, Inspection, inspect, warnings
 from zest_rl.data import reader
 from zest_rl.errors import BadInput
+from zest_rl.kitchen import scene
+from zest_rl.kitchen.views import Views
 from zest_rl.metrics import reward_quality, statistics
 from zest_rl.metrics.statistics import Estimate
 from zest_rl.report import render_html
 from zest_rl.rewards.relabel import relabel_source
 from zest_rl.rewards.scorer import ScorerConfig
-from zest_rl.simulation import rendering
-from zest_rl.simulation.views import Views
 from zest_rl.sources.kitchen import kitchen_source
 
 VIEWS = Views("micro", n_views=1, size=96, tolerance=0.05)
@@ -235,7 +235,7 @@ def test_the_page_shows_tasks_against_goals_and_does_without_where_scorers_are_o
     assert f"<b>{matrix[1][1]:.2f}</b>" in page
     low, high = found["ci95"][1][1]
     assert low <= matrix[1][1] <= high
-    monkeypatch.setattr(rendering, "_RENDERER_VERSION", -1)
+    monkeypatch.setattr(scene, "_RENDERER_VERSION", -1)
     assert zest(*words)["goals_against_tasks"] is None
     assert "<h2>Frames</h2>" not in (tmp_path / "page.html").read_text()
     assert "<h2>Reward quality</h2>" in (tmp_path / "page.html").read_text()

@@ -14,7 +14,7 @@ from PIL import Image
 from zest_rl.analysis.sub_goals import SubGoalScores, rise_in_order
 from zest_rl.kitchen.env import KitchenEnv
 from zest_rl.kitchen.tasks import TASKS
-from zest_rl.simulation.views import Views
+from zest_rl.kitchen.views import Views
 
 Zest = Callable[..., dict[str, Any]]
 Refusal = Callable[..., tuple[int, str]]
@@ -84,7 +84,7 @@ def two_doors(tmp_path: Path) -> Path:
         def show(path: Path, *shares: float) -> None:
             state = start
             for door, share in zip(DOORS, shares, strict=True):
-                state = renderer.with_joint(state, TASKS[door].joint, share * TASKS[door].goal)
+                state = renderer.scene.with_joint(state, TASKS[door].joint, share * TASKS[door].goal)
             path.parent.mkdir(exist_ok=True)
             Image.fromarray(renderer.render(state)[0]).save(path)
 

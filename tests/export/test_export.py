@@ -26,9 +26,9 @@ from zest_rl.errors import BadInput, ZestError
 from zest_rl.export import export, transitions
 from zest_rl.export.lerobot import DATA_FILE
 from zest_rl.export.transitions import shape_rewards
+from zest_rl.kitchen.views import Views
 from zest_rl.rewards.relabel import relabel_source
 from zest_rl.rewards.scorer import ScorerConfig
-from zest_rl.simulation.views import Views
 from zest_rl.sources.kitchen import kitchen_source
 
 SIDE = 16

@@ -12,6 +12,7 @@ from zest_rl.metrics.statistics import (
     iqm,
     mean,
     normalized_return,
+    representative,
     spearman,
     wilson,
 )
@@ -144,3 +145,16 @@ def test_the_wilson_interval_follows_its_formula(k: int, n: int) -> None:
 def test_a_success_rate_of_no_episodes_is_refused() -> None:
     with pytest.raises(BadInput, match="at least 1 episode"):
         wilson(0, 0)
+
+
+@pytest.mark.parametrize(
+    ("returns", "expected"),
+    [
+        ([3.0, 9.0, 1.0, 5.0, 4.0], {"best": 1, "median": 4, "worst": 2}),
+        ([2.0, 7.0, 7.0, 2.0], {"best": 1, "median": 0, "worst": 3}),
+        ([1.0, 2.0], {"best": 1, "median": 0, "worst": 0}),
+        ([5.0], {"best": 0, "median": 0, "worst": 0}),
+    ],
+)
+def test_best_median_and_worst_are_ranks_of_the_return(returns: list[float], expected: dict[str, int]) -> None:
+    assert representative(np.array(returns)) == expected

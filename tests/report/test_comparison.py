@@ -16,6 +16,7 @@ from conftest import COLLECTED
 from zest_rl.data import reader
 from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import EvaluationConfig, evaluate
+from zest_rl.kitchen.videos import Video
 from zest_rl.metrics import statistics
 from zest_rl.report.comparison import (
     Method,
@@ -28,7 +29,6 @@ from zest_rl.report.comparison import (
     return_curve,
 )
 from zest_rl.report.panels import goal_panel, goal_scatter, paired_panels
-from zest_rl.simulation.videos import Video
 
 CONFIG = EvaluationConfig(n_episodes=2, seed=11, rtg="constant")
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from zest_rl.kitchen.views import Views
 from zest_rl.rewards.frame_embeddings import FrameEmbeddings
 from zest_rl.rewards.state_embeddings import EmbedConfig, StateEmbedder, StateEmbeddings
-from zest_rl.simulation.views import Views
 from zest_rl.sources import Source, open_source
 from zest_rl.sources.kitchen import KitchenStates, kitchen_source
 from zest_rl.sources.videos import Clips

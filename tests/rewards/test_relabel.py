@@ -21,6 +21,7 @@ import pytest
 from zest_rl.cli import main
 from zest_rl.data import reader
 from zest_rl.errors import BadInput
+from zest_rl.kitchen.views import Views
 from zest_rl.rewards.relabel import (
     GOAL_FOLDER,
     SCORER_FILE,
@@ -33,7 +34,6 @@ from zest_rl.rewards.relabel import (
 from zest_rl.rewards.scorer import ScorerConfig
 from zest_rl.rewards.state_embeddings import STATES_PER_SHARD
 from zest_rl.rewards.state_scorer import StateScorer
-from zest_rl.simulation.views import Views
 from zest_rl.sources.kitchen import kitchen_source
 
 VIEWS = Views("micro", n_views=1, size=96, tolerance=0.05)

@@ -16,11 +16,11 @@ from zest_rl.embedders import load_embedder
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen.env import KitchenEnv
 from zest_rl.kitchen.tasks import TASKS
+from zest_rl.kitchen.views import Views
 from zest_rl.rewards.embeddings import shared_embedder
 from zest_rl.rewards.scorer import Scorer, ScorerConfig
 from zest_rl.rewards.scores import score_views
 from zest_rl.rewards.state_scorer import StateScorer
-from zest_rl.simulation.views import Views
 
 VIEWS = Views("micro", n_views=2, size=96, tolerance=0.05)
 CONFIG = ScorerConfig("same-scene")

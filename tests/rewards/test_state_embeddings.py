@@ -14,11 +14,11 @@ import torch
 from zest_rl.embedders import load_embedder
 from zest_rl.errors import ZestError
 from zest_rl.kitchen.env import KitchenEnv
+from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.rewards import state_embeddings
 from zest_rl.rewards.state_embeddings import STATES_PER_SHARD, EmbedConfig, StateEmbedder
 from zest_rl.runtime.arrays import write_arrays
 from zest_rl.runtime.parallel import chunks, one_thread
-from zest_rl.simulation.views import Views, canonical_states
 
 VIEWS = Views("micro", n_views=2, size=96)
 CONFIG = EmbedConfig(VIEWS, "efficientnet-lite0")
@@ -202,7 +202,7 @@ def test_two_worker_processes_give_the_bits_of_one_and_end_quietly(
 
 def test_a_process_that_rendered_ends_quietly() -> None:
     code = (
-        "import numpy as np; from zest_rl.simulation.views import Views\n"
+        "import numpy as np; from zest_rl.kitchen.views import Views\n"
         "for size in (32, 64): print(Views('micro', n_views=1, size=size).shared_renderer().render(np.zeros(30)).shape)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

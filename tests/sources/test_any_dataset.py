@@ -35,7 +35,7 @@ from zest_rl.data.writer import write_scored
 from zest_rl.embedders import load_embedder
 from zest_rl.errors import ZestError
 from zest_rl.rewards.scores import score_views
-from zest_rl.simulation.rendering import select_gl_backend
+from zest_rl.runtime.gl import select_gl_backend
 from zest_rl.sources import open_source
 from zest_rl.sources.pictures import Pictures
 from zest_rl.sources.states import stage_of

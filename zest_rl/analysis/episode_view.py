@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.data.video import evenly_spaced
+from zest_rl.kitchen.views import canonical_states
 from zest_rl.rewards.state_scorer import StateScorer
-from zest_rl.simulation.views import canonical_states
 from zest_rl.types import FloatArray
 
 N_FRAMES = 8

@@ -13,10 +13,10 @@ from zest_rl.data import reader
 from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.env import progress_of
 from zest_rl.kitchen.tasks import SUCCESS_PROGRESS, TASKS, Task
+from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.metrics.selection import others
 from zest_rl.rewards.scorer import ScorerConfig
 from zest_rl.rewards.state_scorer import StateScorer
-from zest_rl.simulation.views import Views, canonical_states
 
 Context = Literal["same", "different"]
 """Which trajectory x_0 comes from: the candidate's own (the paper's SG, as we read it), or another one (DG)."""

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from zest_rl.data import reader
 from zest_rl.errors import BadInput
+from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.metrics import reward_quality, statistics
 from zest_rl.metrics.statistics import Estimate
 from zest_rl.report.panels import MIN_EPISODES_TO_RANK
-from zest_rl.simulation.views import Views, canonical_states
 from zest_rl.types import FloatArray, GroundTruth
 
 CLOCK, STRAIGHT, SATURATED, STILL, CONTRADICTORY = 0.95, 0.9, 0.95, 0.9, 0.01

@@ -106,7 +106,7 @@ def check_folder(name: str, folder: Path, variable: str) -> Check:
 
 def check_rendering() -> Iterator[Check]:
     """Render a frame of the kitchen, in a process of its own: a broken GL driver takes its process along."""
-    code = "from zest_rl.simulation.rendering import gl_backend; print(gl_backend())"
+    code = "from zest_rl.kitchen.scene import gl_backend; print(gl_backend())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     if done.returncode == 0:
         yield Check("rendering", "ok", f"MuJoCo draws by {done.stdout.strip()}")

@@ -44,7 +44,8 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     import time
 
     from zest_rl.evaluation.evaluate import evaluate, evaluation_folder
-    from zest_rl.simulation.videos import Video, ensure_videos, representative
+    from zest_rl.kitchen.videos import Video, ensure_videos
+    from zest_rl.metrics.statistics import representative
 
     started = time.monotonic()
     what = settings(config)

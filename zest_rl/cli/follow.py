@@ -105,9 +105,9 @@ def run(config: KitchenArguments | VideoArguments, ui: Ui) -> dict[str, Any]:
 def _kitchen(config: KitchenArguments, ui: Ui) -> list[SubGoalScores]:
     from zest_rl.analysis.sub_goals import score_performance
     from zest_rl.kitchen.task_sequence import perform
+    from zest_rl.kitchen.views import Views
     from zest_rl.rewards.scorer import ScorerConfig
     from zest_rl.rewards.state_scorer import StateScorer
-    from zest_rl.simulation.views import Views
 
     performance = perform(config.tasks, config.seed)
 

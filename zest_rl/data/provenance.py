@@ -39,7 +39,7 @@ class ScorerRecord:
     goal_sha256: str
     embedder_sha256: str
     views: Mapping[str, Any] | None = None
-    """Fields of `zest_rl.simulation.views.Views`, from which kitchen states were rendered; None for other frames."""
+    """Fields of `zest_rl.kitchen.views.Views`, from which kitchen states were rendered; None for other frames."""
     views_sha256: str | None = None
     """Of all that such a frame depends on besides the state."""
 

@@ -1,1 +1,1 @@
-"""One robot, six tasks: the environment, its experts, and how they are recorded."""
+"""One robot, six tasks: the environment, its experts, how they are recorded, and how the scene is drawn."""

@@ -151,3 +151,9 @@ def wilson(n_successes: int, n: int) -> Estimate:
         raise BadInput("a success rate needs at least 1 episode")
     interval = stats.binomtest(n_successes, n).proportion_ci(method="wilson")
     return Estimate(n_successes / n, float(interval.low), float(interval.high))
+
+
+def representative(returns: Values) -> dict[str, int]:
+    """Return the indices of the best, the median and the worst episode by return; ties go to the earlier one."""
+    order = np.argsort(-np.asarray(returns), kind="stable")
+    return {"best": int(order[0]), "median": int(order[len(order) // 2]), "worst": int(order[-1])}

@@ -16,6 +16,7 @@ from zest_rl.agents.foreign import FOREIGN
 from zest_rl.data import reader
 from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import Evaluation, EvaluationConfig, check_finished, evaluation_folder, read_evaluation
+from zest_rl.kitchen.videos import Film, ensure_video
 from zest_rl.metrics import statistics
 from zest_rl.report import Curve, MethodRow, Report, Section
 from zest_rl.report.content import Kind
@@ -23,7 +24,6 @@ from zest_rl.report.panels import episode_panels, goal_panel, goal_scatter, pair
 from zest_rl.rewards.relabel import SCORER_FILE
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
-from zest_rl.simulation.videos import Film, ensure_video
 from zest_rl.training.checkpoints import snapshots
 
 

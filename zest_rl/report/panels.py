@@ -13,13 +13,13 @@ from zest_rl.data import reader
 from zest_rl.data.images import list_images, read_image
 from zest_rl.evaluation.evaluate import Evaluation, evaluation_folder
 from zest_rl.kitchen.tasks import get_task
+from zest_rl.kitchen.videos import FPS, Film, Video
 from zest_rl.metrics import statistics
 from zest_rl.report import EpisodePanel, GoalPanel, Scatter
 from zest_rl.rewards.goals import read_goal, read_text
 from zest_rl.rewards.relabel import GOAL_FOLDER
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
-from zest_rl.simulation.videos import FPS, Film, Video, representative
 from zest_rl.types import FloatArray
 
 MIN_EPISODES_TO_RANK = 3
@@ -54,7 +54,7 @@ def episode_panels(name: str, evaluation: Evaluation, scorer: StateScorer | None
     """Best, median and worst episode of an evaluation: video, score over time, ground-truth progress."""
     panels = []
     folder = evaluation_folder(evaluation.run, evaluation.config)
-    for which, index in representative(evaluation.normalized()).items():
+    for which, index in statistics.representative(evaluation.normalized()).items():
         states: NDArray[np.float64] = evaluation.traces["qpos"][index]
         video = film(Video(states, folder / f"{which}.mp4"))
         panel = _panel(f"{name}: {which}", name, evaluation, index, video)
@@ -92,7 +92,7 @@ def paired_panels(left: tuple[str, Evaluation], right: tuple[str, Evaluation], f
         return []
     panels = []
     before, after = one.normalized(), other.normalized()
-    for which, index in representative(after - before).items():
+    for which, index in statistics.representative(after - before).items():
         before_qpos, after_qpos = one.traces["qpos"][index], other.traces["qpos"][index]
         name = f"pair-{artifacts.hash_arrays(before_qpos, after_qpos)[:8]}.mp4"
         video = film(Video(before_qpos, evaluation_folder(other.run, other.config) / name, beside=after_qpos))

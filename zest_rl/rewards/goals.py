@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from zest_rl.data.images import list_images, read_image
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.tasks import Task, get_task
+from zest_rl.kitchen.views import Views, scene_pair
 from zest_rl.runtime import artifacts
-from zest_rl.simulation.views import Views, scene_pair
 from zest_rl.types import Frame
 
 SAME_SCENE, DRAWINGS, VISUAL_TASKS, OWN_TEXT, TEXT = "same-scene", "drawings", "visual-tasks:", "text", "text:"

@@ -16,6 +16,7 @@ from zest_rl.data.provenance import RelabelRecord, ScorerRecord
 from zest_rl.data.writer import write_scored
 from zest_rl.embedders import DEFAULT_EMBEDDER, Precision
 from zest_rl.errors import BadInput, nearest
+from zest_rl.kitchen.views import Views
 from zest_rl.rewards.embeddings import EpisodeEmbeddings
 from zest_rl.rewards.frame_embeddings import FrameEmbeddings
 from zest_rl.rewards.goals import GoalSpec, read_free_goal, read_kitchen_goal
@@ -24,7 +25,6 @@ from zest_rl.rewards.scores import Features, Similarity
 from zest_rl.rewards.state_embeddings import EmbedConfig, StateEmbedder, StateEmbeddings
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.parallel import Engine
-from zest_rl.simulation.views import Views
 from zest_rl.sources import KitchenStates, Source, open_source
 from zest_rl.types import FloatArray
 

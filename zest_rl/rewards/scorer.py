@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from zest_rl.embedders import Embedder, Precision
 from zest_rl.errors import BadInput, ZestError
+from zest_rl.kitchen.views import Views
 from zest_rl.rewards.embeddings import EmbeddedEpisode, shared_embedder
 from zest_rl.rewards.goals import GoalSpec, embed_goal
 from zest_rl.rewards.scores import (
@@ -31,7 +32,6 @@ from zest_rl.rewards.scores import (
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_arrays, write_arrays
 from zest_rl.runtime.parallel import one_thread
-from zest_rl.simulation.views import Views
 from zest_rl.types import FloatArray
 
 

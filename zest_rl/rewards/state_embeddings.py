@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 
 from zest_rl.embedders import Embedder, Precision
 from zest_rl.errors import ZestError
+from zest_rl.kitchen.views import Views, canonical_states, distinct_states
 from zest_rl.rewards.embeddings import EmbeddedEpisode, check_same_embedder, shared_embedder
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_array, write_arrays
 from zest_rl.runtime.parallel import Engine, cached_jobs, chunks, counted, one_thread
-from zest_rl.simulation.views import Views, canonical_states, distinct_states, state_keys
+from zest_rl.simulation.views import state_keys
 from zest_rl.types import FloatArray
 
 STATES_PER_SHARD = 32

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.errors import ZestError
+from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.rewards.goals import read_kitchen_goal
 from zest_rl.rewards.scorer import Scorer, ScorerConfig
 from zest_rl.rewards.state_embeddings import EmbedConfig, StateEmbedder, StateEmbeddings
-from zest_rl.simulation.views import Views, canonical_states
 from zest_rl.types import FloatArray
 
 

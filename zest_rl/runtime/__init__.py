@@ -1,1 +1,1 @@
-"""What is cut goes on, and what is on disk is whole: artifacts, parallel work, the order of imports."""
+"""What is cut goes on, and what is on disk is whole: artifacts, parallel work, GL, the order of imports."""

@@ -1,96 +1,71 @@
-"""Where frames come from: recorded simulator state, rendered from a ring of views; equal states are one frame.
+"""Where cameras stand around an object, and which states show the same.
 
-With the robot hidden a frame depends on the objects' joints alone. States are rounded to a grid of `tolerance` and the
-*rounded* state is rendered, so a frame is a function of its key, whichever episode met it first.
+States are rounded to a grid and the *rounded* state is rendered, so a frame is a function of its key, whichever episode
+met it first.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.errors import BadInput
-from zest_rl.kitchen.tasks import Task, get_task
-from zest_rl.runtime import artifacts
-from zest_rl.simulation.rendering import (
-    Camera,
-    RenderConfig,
-    StateRenderer,
-    relevant_qpos,
-    ring,
-    shared_renderer,
-)
+from zest_rl.simulation.rendering import Camera
 
 
-@dataclass(frozen=True)
-class Views:
-    """What is rendered of a state: which task is looked at, from how many sides, how finely states are told apart."""
+def ring(
+    lookat: tuple[float, float, float],
+    n_views: int,
+    *,
+    azimuths: tuple[float, float],
+    distances: Sequence[float],
+    elevations: Sequence[float],
+) -> tuple[Camera, ...]:
+    """Return cameras around a point, chosen without any ground truth.
 
-    task: str
-    n_views: int = 8
-    size: int = 224
-    """Side of the square frames, in pixels."""
-    robot: bool = False
-    """Show the robot (the paper removes it from view)."""
-    tolerance: float = 1e-3
-    """Grid on which joint positions are rounded, in rad or m; 0 tells all different states apart."""
+    Args:
+        lookat: the point, in metres.
+        n_views: how many.
+        azimuths: the first and the last, in degrees; the others are spread evenly between, one stands in the middle.
+        distances: in metres; the cameras take them in turn.
+        elevations: in degrees, negative looks down; the cameras take them in turn.
 
-    def __post_init__(self) -> None:
-        get_task(self.task)
-        if not 0 <= self.tolerance < np.inf:
-            raise BadInput(f"tolerance must be a finite number >= 0 (rad or m), got {self.tolerance}")
-
-    @property
-    def render_config(self) -> RenderConfig:
-        """How each view is rendered."""
-        return RenderConfig(size=self.size, robot=self.robot)
-
-    @property
-    def cameras(self) -> tuple[Camera, ...]:
-        """The ring of views."""
-        return ring(get_task(self.task), self.n_views)
-
-    def fingerprint(self) -> str:
-        """Hash of everything that a frame depends on besides the state."""
-        cameras = [[*c.lookat, c.distance, c.azimuth, c.elevation] for c in self.cameras]
-        return artifacts.hash_json([self.render_config.fingerprint(), cameras, self.tolerance])
-
-    def renderer(self) -> StateRenderer:
-        """Open a renderer of these views; close it after use."""
-        return StateRenderer(self.render_config, self.cameras)
-
-    def shared_renderer(self) -> StateRenderer:
-        """Return this process's renderer of these views; never close it."""
-        return shared_renderer(self.render_config, self.cameras)
+    Raises:
+        BadInput: `n_views` is below 1.
+    """
+    if n_views < 1:
+        raise BadInput(f"the number of views must be at least 1, got {n_views}")
+    spread = np.linspace(*azimuths, n_views) if n_views > 1 else [sum(azimuths) / 2]
+    return tuple(
+        Camera(lookat, distances[i % len(distances)], float(azimuth), elevations[i % len(elevations)])
+        for i, azimuth in enumerate(spread)
+    )
 
 
-def canonical_states(qpos: NDArray[np.float64], views: Views) -> NDArray[np.float64]:
-    """Round states to the grid and clear what no frame depends on: (N, nq) → (N, nq); equal rows, equal frames."""
-    columns = relevant_qpos(views.render_config)
+def on_grid(qpos: NDArray[np.float64], visible: slice, tolerance: float) -> NDArray[np.float64]:
+    """Round states to a grid and clear what no frame depends on: (N, nq) → (N, nq); equal rows, equal frames.
+
+    Args:
+        qpos: (N, nq) states.
+        visible: the entries that a frame depends on.
+        tolerance: of the grid, in rad or m; 0 tells all different states apart.
+    """
     states = np.zeros_like(qpos, dtype=np.float64)
-    states[:, columns] = qpos[:, columns]
-    if views.tolerance > 0:
-        states = np.round(states / views.tolerance) * views.tolerance
+    states[:, visible] = qpos[:, visible]
+    if tolerance > 0:
+        states = np.round(states / tolerance) * tolerance
     return states + 0.0  # −0.0 and 0.0 are one state
 
 
-def distinct_states(qpos: NDArray[np.float64], views: Views) -> NDArray[np.float64]:
-    """Canonical states, each once, in the order in which they first appear: (N, nq) → (U, nq)."""
-    states, first = np.unique(canonical_states(qpos, views), axis=0, return_index=True)
-    in_order: NDArray[np.float64] = states[np.argsort(first)]
+def each_once(states: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the distinct rows in the order in which they first appear: (N, nq) → (U, nq)."""
+    rows, first = np.unique(states, axis=0, return_index=True)
+    in_order: NDArray[np.float64] = rows[np.argsort(first)]
     return in_order
 
 
 def state_keys(states: NDArray[np.float64]) -> list[bytes]:
-    """One key per row of canonical states."""
+    """Return one key per row of states on a grid."""
     return [row.tobytes() for row in np.ascontiguousarray(states)]
-
-
-def scene_pair(
-    renderer: StateRenderer, qpos: NDArray[np.float64], task: Task
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Render the scene before and after the task: (nq,) start state → two arrays (V, H, W, 3)."""
-    goal = renderer.with_joint(qpos, task.joint, task.goal)
-    return renderer.render(qpos), renderer.render(goal)

@@ -20,7 +20,7 @@ from zest_rl.data import reader
 from zest_rl.data.observations import choose_pictures
 from zest_rl.data.writer import DatasetCopy, Trajectories
 from zest_rl.errors import BadInput
-from zest_rl.simulation.views import Views
+from zest_rl.kitchen.views import Views
 from zest_rl.sources.base import Frames, Source
 from zest_rl.sources.kitchen import KitchenStates, read_kitchen
 from zest_rl.sources.pictures import Pictures, picture_entries

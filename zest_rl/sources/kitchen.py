@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from zest_rl.data.reader import Dataset, open_dataset
 from zest_rl.data.writer import DatasetCopy
+from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.runtime import artifacts
-from zest_rl.simulation.views import Views, canonical_states
 from zest_rl.sources.base import Source
 from zest_rl.types import Frame
 

@@ -31,9 +31,9 @@ from zest_rl.cli.reproduce.plan import (
 from zest_rl.cli.ui import SilentUi, Ui
 
 if TYPE_CHECKING:
+    from zest_rl.kitchen.videos import Video
     from zest_rl.report import MethodRow, Report
     from zest_rl.report.comparison import Method
-    from zest_rl.simulation.videos import Video
 
 POLL_SECONDS = 2.0
 
@@ -65,10 +65,10 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
 
 def _run(config: Config, ui: Ui) -> dict[str, Any]:
+    from zest_rl.kitchen.videos import ensure_videos, missing
     from zest_rl.report import write_report
     from zest_rl.report.comparison import overview
     from zest_rl.runtime import artifacts
-    from zest_rl.simulation.videos import ensure_videos, missing
 
     output = config.output or Path("runs") / config.file.stem
     recipe = read_recipe(config.file)

@@ -98,9 +98,9 @@ def run(config: Arguments | footage.FootageArguments, ui: Ui) -> dict[str, Any]:
     from zest_rl.analysis.frame_selection import draw_candidates, score_as_actions, score_as_goals
     from zest_rl.data import reader
     from zest_rl.kitchen.tasks import get_task
+    from zest_rl.kitchen.views import Views
     from zest_rl.metrics import selection
     from zest_rl.rewards.scorer import ScorerConfig
-    from zest_rl.simulation.views import Views
 
     if not config.datasets:
         raise BadInput("`zest select` needs at least 1 dataset; `zest collect` makes them")

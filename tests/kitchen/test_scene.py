@@ -16,27 +16,27 @@ import pytest
 from numpy.typing import NDArray
 
 from zest_rl.errors import BadInput
-from zest_rl.kitchen.tasks import TASKS
-from zest_rl.runtime.artifacts import hash_arrays
-from zest_rl.simulation import rendering
-from zest_rl.simulation.rendering import (
+from zest_rl.kitchen.scene import (
     N_QPOS,
     N_ROBOT_QPOS,
-    Camera,
     RenderConfig,
-    StateRenderer,
+    gl_backend,
+    open_renderer,
     relevant_qpos,
-    ring,
+    task_cameras,
 )
+from zest_rl.kitchen.tasks import TASKS, Task
+from zest_rl.runtime.artifacts import hash_arrays
+from zest_rl.runtime.gl import select_gl_backend
+from zest_rl.simulation.rendering import Camera, StateRenderer
 
 KITCHEN_XML = Path("envs", "assets", "kitchen_franka", "kitchen_assets", "kitchen_env_model.xml")
 OVERVIEW = Camera(lookat=(-0.2, 0.4, 2.0), distance=2.0, azimuth=70.0, elevation=-30.0)  # kitchen and robot
 HASH_FRAMES = """
 import numpy as np
-from zest_rl.artifacts import hash_arrays
-from zest_rl.rendering import *
-from zest_rl.tasks import TASKS
-with StateRenderer(RenderConfig(size=64), ring(TASKS["micro"], 3)) as renderer:
+from zest_rl.kitchen.scene import *
+from zest_rl.runtime.artifacts import hash_arrays
+with open_renderer(RenderConfig(size=64), task_cameras(TASKS["micro"], 3)) as renderer:
     print(select_gl_backend(), hash_arrays(renderer.render(np.zeros(N_QPOS))))
 """
 
@@ -62,7 +62,7 @@ def start(physics: mujoco.MjModel) -> NDArray[np.float64]:
 
 @pytest.fixture(scope="module")
 def renderer() -> Iterator[StateRenderer]:
-    with StateRenderer(RenderConfig(size=64), ring(TASKS["micro"], 3)) as opened:
+    with open_renderer(RenderConfig(size=64), task_cameras(TASKS["micro"], 3)) as opened:
         yield opened
 
 
@@ -84,14 +84,14 @@ def test_the_qpos_layout_is_the_one_of_the_physics_model(physics: mujoco.MjModel
 
 
 def test_one_view_is_frontal() -> None:
-    (camera,) = ring(TASKS["micro"], 1)
+    (camera,) = task_cameras(TASKS["micro"], 1)
     assert camera.azimuth == 90
     assert camera.lookat == TASKS["micro"].lookat
 
 
 @pytest.mark.parametrize("n_views", [2, 3, 8, 30])
 def test_a_ring_spreads_its_views(n_views: int) -> None:
-    cameras = ring(TASKS["knob3"], n_views)
+    cameras = task_cameras(TASKS["knob3"], n_views)
     azimuths = [camera.azimuth for camera in cameras]
     assert len(set(cameras)) == n_views
     assert (azimuths[0], azimuths[-1]) == (60, 120)
@@ -102,7 +102,7 @@ def test_a_ring_spreads_its_views(n_views: int) -> None:
 
 def test_a_ring_without_views_is_refused() -> None:
     with pytest.raises(BadInput, match="at least 1, got 0"):
-        ring(TASKS["micro"], 0)
+        task_cameras(TASKS["micro"], 0)
 
 
 def test_there_is_one_rgb_frame_per_camera(renderer: StateRenderer, start: NDArray[np.float64]) -> None:
@@ -114,7 +114,7 @@ def test_there_is_one_rgb_frame_per_camera(renderer: StateRenderer, start: NDArr
 
 def test_frames_are_upright(start: NDArray[np.float64]) -> None:
     from_above = Camera(lookat=(-0.3, 0.5, 1.8), distance=3.0, azimuth=90.0, elevation=-20.0)
-    with StateRenderer(RenderConfig(size=64), (from_above,)) as renderer:
+    with open_renderer(RenderConfig(size=64), (from_above,)) as renderer:
         (frame,) = renderer.render(start)
     assert frame[0].max() == 0, "above the kitchen there is nothing"
     assert frame[-1].min() > 0, "below it is the floor"
@@ -122,10 +122,10 @@ def test_frames_are_upright(start: NDArray[np.float64]) -> None:
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=list(TASKS))
 def test_every_view_of_a_task_shows_its_part_moving(
-    task: rendering.Task, physics: mujoco.MjModel, start: NDArray[np.float64]
+    task: Task, physics: mujoco.MjModel, start: NDArray[np.float64]
 ) -> None:
-    with StateRenderer(RenderConfig(size=112), ring(task, 8)) as renderer:
-        moved = renderer.with_joint(start, task.joint, task.goal)
+    with open_renderer(RenderConfig(size=112), task_cameras(task, 8)) as renderer:
+        moved = renderer.scene.with_joint(start, task.joint, task.goal)
         change = np.abs(renderer.render(moved).astype(int) - renderer.render(start)).max(axis=-1) > 20
     assert moved[physics.joint(task.joint).qposadr[0]] == task.goal
     for equality in range(physics.neq):  # the burner rises with its knob
@@ -140,7 +140,7 @@ def test_every_view_of_a_task_shows_its_part_moving(
 def test_frames_repeat_bitwise_in_another_renderer_and_another_process(start: NDArray[np.float64]) -> None:
     digests = set()
     for _ in range(2):
-        with StateRenderer(RenderConfig(size=64), ring(TASKS["micro"], 3)) as renderer:
+        with open_renderer(RenderConfig(size=64), task_cameras(TASKS["micro"], 3)) as renderer:
             renderer.render(start)
             digests.add(hash_arrays(renderer.render(np.zeros(N_QPOS))))
     other = in_another_process()
@@ -150,7 +150,7 @@ def test_frames_repeat_bitwise_in_another_renderer_and_another_process(start: ND
 
 def test_two_renderers_can_draw_in_turn(renderer: StateRenderer, start: NDArray[np.float64]) -> None:
     alone = renderer.render(start)
-    with StateRenderer(RenderConfig(size=32), (OVERVIEW,)) as other:
+    with open_renderer(RenderConfig(size=32), (OVERVIEW,)) as other:
         small = other.render(start)
         np.testing.assert_array_equal(renderer.render(start), alone)
         np.testing.assert_array_equal(other.render(start), small)
@@ -160,10 +160,10 @@ def test_two_renderers_can_draw_in_turn(renderer: StateRenderer, start: NDArray[
 def test_a_hidden_robot_leaves_no_trace_and_a_shown_one_does(start: NDArray[np.float64]) -> None:
     moved = start.copy()
     moved[:N_ROBOT_QPOS] += 0.3
-    robot_in_view, robot_behind = OVERVIEW, ring(TASKS["ldoor"], 1)[0]
+    robot_in_view, robot_behind = OVERVIEW, task_cameras(TASKS["ldoor"], 1)[0]
     seen = {}
     for robot in (False, True):
-        with StateRenderer(RenderConfig(size=96, robot=robot), (robot_in_view, robot_behind)) as renderer:
+        with open_renderer(RenderConfig(size=96, robot=robot), (robot_in_view, robot_behind)) as renderer:
             seen[robot] = renderer.render(start), renderer.render(moved)
     np.testing.assert_array_equal(*seen[False])
     assert (seen[True][0][0] != seen[True][1][0]).any(), "a shown robot moves"
@@ -179,7 +179,7 @@ def test_a_frame_depends_on_the_objects_and_on_a_robot_that_is_shown() -> None:
 def test_a_decimated_robot_looks_like_the_whole_one(start: NDArray[np.float64]) -> None:
     frames = []
     for fraction in (0.1, 1.0):
-        with StateRenderer(RenderConfig(robot=True, mesh_fraction=fraction), (OVERVIEW,)) as renderer:
+        with open_renderer(RenderConfig(robot=True, mesh_fraction=fraction), (OVERVIEW,)) as renderer:
             frames.append(renderer.render(start))
     assert (frames[0] != frames[1]).any()
     assert psnr(*frames) >= 30
@@ -201,7 +201,7 @@ def test_a_state_that_is_not_finite_is_refused(renderer: StateRenderer, value: f
 
 def test_a_renderer_without_cameras_is_refused() -> None:
     with pytest.raises(BadInput, match="at least 1 camera"):
-        StateRenderer(RenderConfig(), ())
+        open_renderer(RenderConfig(), ())
 
 
 @pytest.mark.parametrize(
@@ -225,8 +225,8 @@ def test_the_fingerprint_follows_what_changes_frames_and_nothing_else() -> None:
 
 
 def test_the_working_gl_backend_is_named_and_kept_for_others() -> None:
-    name = rendering.gl_backend()
-    assert name == os.environ["MUJOCO_GL"] == rendering.select_gl_backend()
+    name = gl_backend()
+    assert name == os.environ["MUJOCO_GL"] == select_gl_backend()
 
 
 def test_without_egl_osmesa_draws_the_same_frames_or_the_missing_packages_are_named(start: NDArray[np.float64]) -> None:

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from zest_rl.data import reader as data
-from zest_rl.simulation.rendering import RenderConfig, StateRenderer
-from zest_rl.simulation.videos import (
+from zest_rl.kitchen.scene import RenderConfig, open_renderer
+from zest_rl.kitchen.videos import (
     FPS,
-    SCENE,
+    OVERVIEW,
     Video,
     ensure_videos,
-    representative,
     write_video,
 )
 
@@ -35,7 +34,7 @@ def test_a_video_is_h264_with_one_frame_per_state_and_shows_the_states(states: n
     assert meta["codec"] == "h264"
     assert meta["fps"] == FPS == 12.5
     assert frames.shape == (N_FRAMES, 160, 160, 3)
-    with StateRenderer(RenderConfig(size=160, robot=True), (SCENE,)) as renderer:
+    with open_renderer(RenderConfig(size=160, robot=True), (OVERVIEW,)) as renderer:
         rendered = np.stack([renderer.render(state)[0] for state in states])
     error = [[np.abs(shown - true.astype(float)).mean() for true in rendered] for shown in frames.astype(float)]
     np.testing.assert_array_equal(np.argmin(error, axis=1), np.arange(N_FRAMES))  # each frame is of its own state
@@ -47,7 +46,7 @@ def test_two_episodes_are_shown_side_by_side(states: np.ndarray, tmp_path: Path)
     path = write_video(Video(states[:3], tmp_path / "pair.mp4", beside=states[::-1][:3]), size=96)
     frames = np.stack([np.asarray(frame) for frame in imageio.mimread(path)]).astype(float)
     assert frames.shape == (3, 96, 192, 3)
-    with StateRenderer(RenderConfig(size=96, robot=True), (SCENE,)) as renderer:
+    with open_renderer(RenderConfig(size=96, robot=True), (OVERVIEW,)) as renderer:
         for side, episode in ((frames[:, :, :96], states), (frames[:, :, 96:], states[::-1])):
             for shown, state in zip(side, episode[:3], strict=True):
                 assert np.abs(shown - renderer.render(state)[0].astype(float)).mean() < 8
@@ -69,16 +68,3 @@ def test_videos_are_written_side_by_side_and_those_that_are_there_are_left(state
     assert videos[0].path.read_bytes() == b"made before"
     assert [len(imageio.mimread(video.path)) for video in videos[1:]] == [2, 2, 2]
     assert {path.name for path in tmp_path.glob("*.mp4*")} == {"0.mp4", "1.mp4", "2.mp4"}
-
-
-@pytest.mark.parametrize(
-    ("returns", "expected"),
-    [
-        ([3.0, 9.0, 1.0, 5.0, 4.0], {"best": 1, "median": 4, "worst": 2}),
-        ([2.0, 7.0, 7.0, 2.0], {"best": 1, "median": 0, "worst": 3}),
-        ([1.0, 2.0], {"best": 1, "median": 0, "worst": 0}),
-        ([5.0], {"best": 0, "median": 0, "worst": 0}),
-    ],
-)
-def test_best_median_and_worst_are_ranks_of_the_return(returns: list[float], expected: dict[str, int]) -> None:
-    assert representative(np.array(returns)) == expected

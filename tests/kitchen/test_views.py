@@ -7,9 +7,11 @@ import pytest
 
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.env import KitchenEnv
+from zest_rl.kitchen.scene import N_QPOS, N_ROBOT_QPOS
 from zest_rl.kitchen.tasks import TASKS
-from zest_rl.simulation.rendering import N_QPOS, N_ROBOT_QPOS, StateRenderer
-from zest_rl.simulation.views import Views, canonical_states, scene_pair, state_keys
+from zest_rl.kitchen.views import Views, canonical_states, scene_pair
+from zest_rl.simulation.rendering import StateRenderer
+from zest_rl.simulation.views import state_keys
 
 VIEWS = Views("micro", n_views=2, size=96, tolerance=1e-2)
 MICROWAVE = 22

@@ -1,0 +1,147 @@
+"""The kitchen as it is drawn: a render-only model, and cameras around the part that a task moves.
+
+The model never steps, so everything that costs time but shows nothing is left out of it (shadows, reflections,
+multisampling, the sky, most faces of the robot's meshes, and the whole robot when it is hidden). The physics model
+stays untouched; only the joint positions ``qpos`` are taken over.
+"""
+
+from __future__ import annotations
+
+import atexit
+import dataclasses
+import functools
+import importlib.metadata
+import importlib.util
+from dataclasses import dataclass
+from pathlib import Path
+
+import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
+import mujoco
+import numpy as np
+
+from zest_rl.errors import BadInput, ZestError
+from zest_rl.kitchen.tasks import TASKS, Task
+from zest_rl.runtime import artifacts
+from zest_rl.runtime.gl import INSTALL_GL, select_gl_backend
+from zest_rl.simulation.rendering import Camera, StateRenderer
+from zest_rl.simulation.scene import Scene, compile_for_drawing, decimate
+from zest_rl.simulation.views import ring
+
+N_QPOS = 30
+"""Length of the kitchen's qpos."""
+N_ROBOT_QPOS = 9
+"""The leading entries of qpos: 7 arm joints and 2 fingers; the rest belongs to objects."""
+
+_RENDERER_VERSION = 1  # raise it when a pixel changes, here or in simulation/: cached embeddings depend on it
+_KITCHEN = Path("envs", "assets", "kitchen_franka")
+_ROBOT_ROOT = "panda0_link0"
+_AZIMUTHS = (60.0, 120.0)  # degrees; 90 looks from the robot's side straight at the kitchen
+_DISTANCES = (1.0, 0.7, 1.4)  # metres
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """What frames look like, apart from the cameras."""
+
+    size: int = 224
+    """Height and width of a frame, in pixels."""
+    robot: bool = False
+    """Show the robot. Hidden, as in the paper, a frame depends on the objects alone."""
+    mesh_fraction: float = 0.1
+    """Share of the robot's visual faces that is kept, in (0, 1]; no effect while the robot is hidden."""
+
+    def __post_init__(self) -> None:
+        if self.size < 1:
+            raise BadInput(f"size must be at least 1 pixel, got {self.size}; embedders usually want 224")
+        if not 0 < self.mesh_fraction <= 1:
+            raise BadInput(f"mesh_fraction must be in (0, 1], got {self.mesh_fraction}; 1 keeps every face")
+
+    def fingerprint(self) -> str:
+        """Return a sha256 over all that decides a frame except state and cameras: config, code, MuJoCo, assets.
+
+        Raises:
+            ZestError: gymnasium-robotics is not installed.
+        """
+        config = dataclasses.asdict(self)
+        versions = {"renderer": _RENDERER_VERSION, "mujoco": mujoco.__version__}
+        if self.robot:
+            versions["fast-simplification"] = importlib.metadata.version("fast-simplification")
+        else:
+            del config["mesh_fraction"]
+        root = _kitchen_folder()
+        assets = {str(p.relative_to(root)): artifacts.hash_file(p) for p in root.rglob("*") if p.is_file()}
+        return artifacts.hash_json({"config": config, "versions": versions, "assets": assets})
+
+
+def relevant_qpos(config: RenderConfig) -> slice:
+    """Return the entries of qpos (30,) that a frame depends on; states equal in these have equal frames."""
+    return slice(0 if config.robot else N_ROBOT_QPOS, N_QPOS)
+
+
+def task_cameras(task: Task, n_views: int) -> tuple[Camera, ...]:
+    """Return a ring of views around the part that `task` moves, from 60 to 120 degrees.
+
+    Raises:
+        BadInput: `n_views` is below 1.
+    """
+    return ring(task.lookat, n_views, azimuths=_AZIMUTHS, distances=_DISTANCES, elevations=task.elevations)
+
+
+def open_renderer(config: RenderConfig, cameras: tuple[Camera, ...]) -> StateRenderer:
+    """Build the render-only model and a renderer of it; close it after use.
+
+    Raises:
+        BadInput: there is no camera.
+        ZestError: no GL backend works, or gymnasium-robotics is not installed.
+    """
+    return StateRenderer(Scene(_render_model(config), N_QPOS, relevant_qpos(config)), cameras, config.size)
+
+
+@functools.cache
+def shared_renderer(config: RenderConfig, cameras: tuple[Camera, ...]) -> StateRenderer:
+    """Return this process's renderer, open until the process ends: to build one takes half a second, or with the
+    robot's meshes two.
+    """
+    renderer = open_renderer(config, cameras)
+    atexit.register(renderer.close)  # left open, or closed after the GL library, it complains when the process ends
+    return renderer
+
+
+def gl_backend() -> str:
+    """Return the name of the GL backend that works, seen by rendering one frame.
+
+    Raises:
+        ZestError: none works.
+    """
+    with open_renderer(RenderConfig(size=64), task_cameras(TASKS["micro"], 1)) as renderer:
+        frame = renderer.render(np.zeros(N_QPOS))
+    if frame.min() == frame.max():
+        raise ZestError(f"the GL backend {select_gl_backend()!r} renders blank frames; {INSTALL_GL}")
+    return select_gl_backend()
+
+
+def _kitchen_folder() -> Path:
+    package = importlib.util.find_spec("gymnasium_robotics")  # finds the package without running its code
+    if package is None or package.origin is None:
+        raise ZestError(
+            "the kitchen's model comes with gymnasium-robotics, which is not installed; pip install zest-rl"
+        )
+    return Path(package.origin).parent / _KITCHEN
+
+
+def _render_model(config: RenderConfig) -> mujoco.MjModel:
+    """Compile the kitchen with what cannot be seen left out."""
+    folder = _kitchen_folder()
+    spec = mujoco.MjSpec.from_file(str(folder / "kitchen_assets" / "kitchen_env_model.xml"))
+    if config.robot:
+        for mesh in spec.meshes if config.mesh_fraction < 1 else ():
+            if mesh.file.startswith("visual/"):  # 94 % of all faces; the kitchen's own meshes are small and stay exact
+                decimate(mesh, folder / "franka_assets" / "meshes" / mesh.file, config.mesh_fraction)
+    else:
+        for element in (*spec.actuators, *spec.keys, spec.body(_ROBOT_ROOT).parent):
+            spec.delete(element)
+        for mesh in spec.meshes:
+            if mesh.file.startswith(("visual/", "collision/")):
+                spec.delete(mesh)
+    spec.delete(spec.texture("skybox"))  # black with random specks; without it the background is plain black
+    return compile_for_drawing(spec, config.size)

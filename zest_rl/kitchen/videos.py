@@ -1,0 +1,72 @@
+"""Recorded kitchen states → MP4 videos with the robot in view, for people to look at; no score uses them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.kitchen.scene import RenderConfig, shared_renderer
+from zest_rl.runtime.parallel import run_jobs
+from zest_rl.simulation.rendering import Camera
+from zest_rl.simulation.videos import write_mp4
+
+OVERVIEW = Camera(lookat=(-0.4, 0.3, 1.9), distance=2.4, azimuth=60.0, elevation=-25.0)
+"""Robot, microwave, stove and cabinets in one picture."""
+FPS = 12.5
+"""Frames per second of the environment: a video runs in real time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Video:
+    """An episode to be shown, and where."""
+
+    states: NDArray[np.float64]
+    """(T+1, nq) simulator positions."""
+    path: Path
+    beside: NDArray[np.float64] | None = None
+    """(T+1, nq) of another episode, which is shown to the right."""
+
+
+Film = Callable[[Video], Path]
+"""Returns the path of a video that is there, or will be when somebody looks at it."""
+
+
+def write_video(video: Video, size: int = 320) -> Path:
+    """Render an episode and write it as H.264, atomically; `size` is the side of the square frames, in even pixels."""
+    episodes = [video.states] if video.beside is None else [video.states, video.beside]
+    renderer = shared_renderer(RenderConfig(size=size, robot=True), (OVERVIEW,))
+    frames = (np.hstack([renderer.render(qpos)[0] for qpos in step]) for step in zip(*episodes, strict=True))
+    write_mp4(video.path, frames, FPS)
+    return video.path
+
+
+def ensure_video(video: Video) -> Path:
+    """Return the video's path, after `write_video` if nothing is there yet."""
+    return video.path if video.path.exists() else write_video(video)
+
+
+def missing(videos: Iterable[Video]) -> dict[Path, Video]:
+    """Return by their paths those videos that are not there."""
+    return {video.path: video for video in videos if not video.path.exists()}
+
+
+def ensure_videos(
+    videos: Iterable[Video], *, n_workers: int | None = None, on_done: Callable[[], None] = lambda: None
+) -> None:
+    """Write the `missing` videos, one process per core.
+
+    Args:
+        videos: what to write.
+        n_workers: number of processes, default one per core.
+        on_done: called for each of them.
+
+    Raises:
+        ZestError: a process died; finished videos are kept.
+    """
+    jobs = {str(path): video for path, video in missing(videos).items()}
+    for _ in run_jobs(write_video, jobs, n_workers=n_workers):
+        on_done()

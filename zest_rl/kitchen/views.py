@@ -1,0 +1,78 @@
+"""Kitchen states → frames: rendered from a ring of views around what the task moves; equal states are one frame.
+
+With the robot hidden a frame depends on the objects' joints alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.errors import BadInput
+from zest_rl.kitchen.scene import RenderConfig, open_renderer, relevant_qpos, shared_renderer, task_cameras
+from zest_rl.kitchen.tasks import Task, get_task
+from zest_rl.runtime import artifacts
+from zest_rl.simulation.rendering import Camera, StateRenderer
+from zest_rl.simulation.views import each_once, on_grid
+
+
+@dataclass(frozen=True)
+class Views:
+    """What is rendered of a state: which task is looked at, from how many sides, how finely states are told apart."""
+
+    task: str
+    n_views: int = 8
+    size: int = 224
+    """Side of the square frames, in pixels."""
+    robot: bool = False
+    """Show the robot (the paper removes it from view)."""
+    tolerance: float = 1e-3
+    """Grid on which joint positions are rounded, in rad or m; 0 tells all different states apart."""
+
+    def __post_init__(self) -> None:
+        get_task(self.task)
+        if not 0 <= self.tolerance < np.inf:
+            raise BadInput(f"tolerance must be a finite number >= 0 (rad or m), got {self.tolerance}")
+
+    @property
+    def render_config(self) -> RenderConfig:
+        """How each view is rendered."""
+        return RenderConfig(size=self.size, robot=self.robot)
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The ring of views."""
+        return task_cameras(get_task(self.task), self.n_views)
+
+    def fingerprint(self) -> str:
+        """Hash of everything that a frame depends on besides the state."""
+        cameras = [[*c.lookat, c.distance, c.azimuth, c.elevation] for c in self.cameras]
+        return artifacts.hash_json([self.render_config.fingerprint(), cameras, self.tolerance])
+
+    def renderer(self) -> StateRenderer:
+        """Open a renderer of these views; close it after use."""
+        return open_renderer(self.render_config, self.cameras)
+
+    def shared_renderer(self) -> StateRenderer:
+        """Return this process's renderer of these views; never close it."""
+        return shared_renderer(self.render_config, self.cameras)
+
+
+def canonical_states(qpos: NDArray[np.float64], views: Views) -> NDArray[np.float64]:
+    """Round states to the grid and clear what no frame depends on: (N, nq) → (N, nq); equal rows, equal frames."""
+    return on_grid(qpos, relevant_qpos(views.render_config), views.tolerance)
+
+
+def distinct_states(qpos: NDArray[np.float64], views: Views) -> NDArray[np.float64]:
+    """Canonical states, each once, in the order in which they first appear: (N, nq) → (U, nq)."""
+    return each_once(canonical_states(qpos, views))
+
+
+def scene_pair(
+    renderer: StateRenderer, qpos: NDArray[np.float64], task: Task
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Render the scene before and after the task: (nq,) start state → two arrays (V, H, W, 3)."""
+    goal = renderer.scene.with_joint(qpos, task.joint, task.goal)
+    return renderer.render(qpos), renderer.render(goal)

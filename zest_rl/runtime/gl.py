@@ -1,0 +1,60 @@
+"""Which GL library draws, and a context of it: EGL, or OSMesa in software, or what the user says by ``MUJOCO_GL``."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+import subprocess
+import sys
+from typing import Any
+
+import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
+import mujoco
+
+from zest_rl.errors import ZestError
+
+INSTALL_GL = "apt-get install libegl1 libgl1 libosmesa6"
+
+
+def select_gl_backend() -> str:
+    """Return the GL backend for this process: the user's ``MUJOCO_GL``, else EGL, else OSMesa.
+
+    A choice is kept in ``MUJOCO_GL``, so that child processes and other renderers agree. It is tried out in a process
+    of its own, because PyOpenGL cannot change its backend after a failed attempt.
+
+    Raises:
+        ZestError: neither EGL nor OSMesa works.
+    """
+    chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if chosen:
+        return chosen
+    if platform.system() != "Linux":
+        return "native"
+    probe = "import sys, importlib; importlib.import_module('mujoco.' + sys.argv[1]).GLContext(8, 8).make_current()"
+    for backend in ("egl", "osmesa"):
+        environ = os.environ | {"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
+        if subprocess.run([sys.executable, "-c", probe, backend], env=environ, capture_output=True).returncode == 0:
+            os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = backend
+            return backend
+    raise ZestError(f"no frame can be rendered: neither EGL nor OSMesa works here; {INSTALL_GL}")
+
+
+def open_gl(model: mujoco.MjModel, size: int) -> tuple[Any, mujoco.MjrContext]:
+    """Return a GL context, current in this thread, and MuJoCo's drawing context in it, for frames of `size` pixels.
+
+    Raises:
+        ZestError: no GL backend works.
+    """
+    backend = select_gl_backend()
+    try:
+        module = f"mujoco.{backend}" if backend in ("egl", "osmesa") else "mujoco.gl_context"
+        gl = importlib.import_module(module).GLContext(size, size)
+        gl.make_current()
+        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
+    except Exception as error:  # each backend and driver raises another type
+        raise ZestError(
+            f"the GL backend {backend!r} does not work: {error}; {INSTALL_GL}, or unset MUJOCO_GL"
+        ) from error
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
+    return gl, context

@@ -1,0 +1,61 @@
+"""MuJoCo models made to be drawn: what is looked at, without the parts that hide it or cost time and show nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
+import fast_simplification
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A render-only copy of a simulated model, from which parts such as the robot may be left out."""
+
+    model: mujoco.MjModel
+    """It never steps."""
+    n_qpos: int
+    """Length of a state of the simulated model."""
+    visible: slice
+    """Entries of such a state that `model` has joints for, in their order; a frame depends on no others."""
+
+    def with_joint(self, qpos: NDArray[np.float64], joint: str, position: float) -> NDArray[np.float64]:
+        """Return a copy of a state (n_qpos,) with one of the scene's joints moved to `position` (rad or m).
+
+        What the model couples to the joint moves along: in the kitchen a burner rises, and so turns red, with its knob.
+        """
+        model, first = self.model, self.visible.start
+        mover = model.joint(joint).id
+        moved = qpos.copy()
+        moved[first + model.jnt_qposadr[mover]] = position
+        coupled = (model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & (model.eq_obj1id == mover)
+        for equality in np.flatnonzero(coupled):  # mover = offset + slope · follower, both from their rest positions
+            offset, slope = model.eq_data[equality, :2]
+            address = model.jnt_qposadr[model.eq_obj2id[equality]]
+            rest = model.qpos0[model.jnt_qposadr[mover]]
+            moved[first + address] = model.qpos0[address] + (position - rest - offset) / slope
+        return moved
+
+
+def compile_for_drawing(spec: mujoco.MjSpec, size: int) -> mujoco.MjModel:
+    """Compile a model for square frames of `size` pixels, without shadows and multisampling."""
+    visual = spec.visual
+    visual.global_.offwidth = visual.global_.offheight = size
+    visual.quality.shadowsize = visual.quality.offsamples = 0
+    visual.quality.numslices = 12
+    return spec.compile()
+
+
+def decimate(mesh: Any, stl: Path, fraction: float) -> None:
+    """Replace the file of a spec's mesh, a binary STL, by about `fraction` of its faces."""
+    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    corners = np.frombuffer(stl.read_bytes(), record, offset=84)["corners"]  # after a title of 80 bytes, uint32 count
+    vertices, faces = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    vertices, faces = fast_simplification.simplify(vertices, faces.reshape(-1, 3), target_reduction=1 - fraction)
+    mesh.file = ""
+    mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
