@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.data import reader
+from zest_rl.data.reader import open_dataset
 from zest_rl.data.writer import write_dataset
 from zest_rl.kitchen import collect
 from zest_rl.kitchen.views import Views, distinct_states
@@ -106,7 +106,8 @@ def relabel_ms(episodes: dict[str, NDArray[Any]]) -> tuple[float, float]:
     start = cpu_seconds()
     made = relabel_source(kitchen_source(DATASET, VIEWS), CONFIG, n_workers=1)
     milliseconds = 1e3 * (cpu_seconds() - start) / VIEWS.n_views
-    assert np.ptp([episode.rewards.sum() for episode in reader.read_episodes(made.dataset_id)]) > 0
+    with open_dataset(made.dataset_id) as ds:
+        assert np.ptp([rewards.sum() for rewards in ds.rewards()]) > 0
     return milliseconds / made.n_frames, milliseconds / made.n_embedded
 
 

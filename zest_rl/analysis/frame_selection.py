@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.data import reader
+from zest_rl.data.reader import open_dataset
 from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.env import progress_of
 from zest_rl.kitchen.tasks import SUCCESS_PROGRESS, TASKS, Task
@@ -88,8 +88,8 @@ def draw_candidates(dataset_ids: Sequence[str], n_frames: int, seed: int = 0) ->
     trajectory: list[int] = []
     tasks: list[str] = []
     for dataset_id in dataset_ids:
-        episodes = reader.read_states(dataset_id)
-        name = reader.task_name(dataset_id)
+        with open_dataset(dataset_id) as ds:
+            episodes, name = ds.states(), ds.kitchen_task()
         steps = [(i, t) for i, episode in enumerate(episodes) for t in range(1, len(episode))]
         chosen = rng.permutation(len(steps))[:n_frames]
         for i, t in (steps[k] for k in np.sort(chosen)):

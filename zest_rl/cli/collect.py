@@ -10,6 +10,7 @@ from zest_rl.cli.ui import Ui
 from zest_rl.errors import BadInput
 
 if TYPE_CHECKING:
+    from zest_rl.data.provenance import CollectRecord
     from zest_rl.kitchen.collect import Behaviour
 
 FLAWS = ("noise_max", "stop_share", "slow_max", "bias_max", "grip_max")
@@ -99,15 +100,16 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     asked["env"] = ENV_ID
     path = reader.dataset_path(dataset_id)
     if reader.exists(dataset_id):
-        made_by = reader.read_metadata(dataset_id).get("zest", {}).get("collect", {})
-        if not _is_same(asked, made_by):
+        with reader.open_dataset(dataset_id) as ds:
+            record = ds.record.collect
+        if record is None or not _is_same(asked, record):
             raise BadInput(
                 f"dataset {dataset_id} exists and was collected with other arguments, or in another version of the "
-                f"environment ({made_by.get('asked')}); "
+                f"environment ({None if record is None else record.asked}); "
                 f"choose another id with --dataset, or delete {path}"
             )
         ui.say(f"{dataset_id} is there already, nothing to do")
-        return {**made_by["result"], "dataset": dataset_id, "path": str(path), "next": _next(dataset_id)}
+        return {**record.result, "dataset": dataset_id, "path": str(path), "next": _next(dataset_id)}
 
     n_reference = collect.N_REFERENCE
     with ui.progress("reference returns (expert, doing nothing)", n_reference + collect.N_NOTHING) as advance:
@@ -154,19 +156,17 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     return {**result, "dataset": dataset_id, "path": str(path), "next": _next(dataset_id)}
 
 
-def _is_same(asked: Mapping[str, Any], made_by: Mapping[str, Any]) -> bool:
+def _is_same(asked: Mapping[str, Any], record: CollectRecord) -> bool:
     """Whether a dataset is what is asked for; a number that calibration found is as good as the same number given."""
     from zest_rl.kitchen.collect import TOLERANCE
 
-    if not made_by:
-        return False
-    found = {name: made_by["result"][name] for name in FLAWS}
+    found = {name: record.result[name] for name in FLAWS}
     calibrated = any(asked[name] == "calibrate" for name in FLAWS)
-    off_by = abs(made_by["result"]["normalized_return"]["value"] - asked["level"])
+    off_by = abs(record.result["normalized_return"]["value"] - asked["level"])
     wanted = {name: found[name] if asked[name] == "calibrate" else asked[name] for name in FLAWS}
     ignored = {**dict.fromkeys(FLAWS), "level": None}
     return (
-        {**asked, **ignored} == {**made_by["asked"], **ignored}
+        {**asked, **ignored} == {**record.asked, **ignored}
         and wanted == found
         and (not calibrated or off_by <= TOLERANCE)
     )

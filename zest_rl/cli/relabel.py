@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from zest_rl.cli.ui import Ui, progress_in_parts
 from zest_rl.errors import BadInput
 from zest_rl.rewards.scores import Features, Similarity, check_goal_share, check_names
+
+if TYPE_CHECKING:
+    from zest_rl.data.reader import Dataset
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
     import numpy as np
 
-    from zest_rl.data import reader
+    from zest_rl.data.reader import open_dataset
     from zest_rl.rewards.relabel import relabel
 
     started = time.monotonic()
@@ -79,7 +82,9 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         ui.say(f"{relabeled.dataset_id} is there already, nothing to do")
     if relabeled.source.frames.describe().get("qpos_is_noisy"):
         ui.warn("states are read from observations that the environment blurred: what is shown trembles a little")
-    returns = np.array([rewards.sum() for rewards in reader.read_rewards(relabeled.dataset_id)])
+    with open_dataset(relabeled.dataset_id) as ds:
+        returns = np.array([rewards.sum() for rewards in ds.rewards()])
+        command = _next_command(ds)
     if np.ptp(returns) == 0:
         ui.warn("all episodes have the same return: this goal and embedder tell nothing apart")
     return {
@@ -92,19 +97,18 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "return_min": float(returns.min()),
         "return_max": float(returns.max()),
         "seconds": round(time.monotonic() - started, 2),
-        "next": _next(relabeled.dataset_id),
+        "next": command,
     }
 
 
-def _next(dataset_id: str) -> str:
+def _next_command(ds: Dataset) -> str:
     """Name a command that works on what a dataset observes and how it acts."""
     import numpy as np
 
-    from zest_rl.data import reader
     from zest_rl.data.observations import acts_discretely, entries, is_numbers
 
-    with reader.open_episodes(dataset_id) as (file, names):
-        if not any(map(is_numbers, entries(file[names[0]]["observations"]).values())):
-            return f"zest inspect {dataset_id}"
-        trains = all(not acts_discretely(file[name]) and np.abs(file[name]["actions"][()]).max() <= 1 for name in names)
-    return f"zest train dt {dataset_id}" if trains else f"zest export {dataset_id} --to npz"
+    groups = list(ds.groups.values())
+    if not any(map(is_numbers, entries(groups[0]["observations"]).values())):
+        return f"zest inspect {ds.id}"
+    trains = all(not acts_discretely(group) and np.abs(group["actions"][()]).max() <= 1 for group in groups)
+    return f"zest train dt {ds.id}" if trains else f"zest export {ds.id} --to npz"

@@ -8,7 +8,6 @@ rewards it was trained on. Ground-truth rewards are recorded, and shown to no po
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.agents import Policy, load_policy
-from zest_rl.data import reader
 from zest_rl.data.env_specs import check_env_spec, check_registered
+from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.env import ENV_ID
 from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return, wilson
@@ -120,8 +119,8 @@ def uses_online_scores(policy: Policy, config: EvaluationConfig) -> bool:
 
 def _reward_kind(policy: Policy) -> Reward | None:
     """How the rewards that the policy was trained on follow from scores; None when they are not ZeST scores."""
-    relabel = policy.meta["dataset"]["zest"].get("relabel")
-    return None if relabel is None else relabel["reward"]
+    relabel = DatasetRecord.from_description(policy.meta["dataset"]).relabel
+    return None if relabel is None else relabel.reward
 
 
 def rollout(
@@ -206,8 +205,9 @@ def _kitchen_spec(env_spec: str) -> gymnasium.envs.registration.EnvSpec:
 
 
 def is_evaluable(dataset: Mapping[str, Any]) -> bool:
-    """Whether the `zest_rl.data.reader.describe` of a run's dataset is of the environment that `evaluate` runs."""
-    return not reader.is_foreign(dataset) or json.loads(dataset["env_spec"] or "{}").get("id") == ENV_ID
+    """Whether a run's dataset (`zest_rl.data.reader.Dataset.describe`) is of the environment that `evaluate` runs."""
+    record = DatasetRecord.from_description(dataset)
+    return not record.is_foreign or record.env.get("id") == ENV_ID
 
 
 def _decrement(
@@ -277,7 +277,7 @@ def evaluate(
     if scored and not (run / SCORER_FILE).exists():
         reason = (
             "its frames are from elsewhere, so scores cannot be made online; use --rtg constant"
-            if reader.is_foreign(dataset)
+            if DatasetRecord.from_description(dataset).is_foreign
             else "it was not trained on a relabeled dataset; use --rtg constant, or train on what `zest relabel` writes"
         )
         raise BadInput(f"scores are needed, but {run.name} has no {SCORER_FILE}: {reason}")

@@ -292,12 +292,13 @@ def plan_cells(plan: Plan, datasets: Mapping[str, TaskData], output: Path) -> li
     """
     from zest_rl.agents.foreign import identify
     from zest_rl.cli.config import load_config
-    from zest_rl.data import reader
+    from zest_rl.data.reader import open_dataset
     from zest_rl.runtime import artifacts
 
-    described = {
-        name: reader.describe(name) for task in datasets.values() for name in (task.source, *task.by_goal.values())
-    }
+    described = {}
+    for name in (name for task in datasets.values() for name in (task.source, *task.by_goal.values())):
+        with open_dataset(name) as ds:
+            described[name] = ds.describe()
     cells, problems = [], []
     for seed, (name, method), (task, of_task) in product(plan.recipe.seeds, plan.methods.items(), datasets.items()):
         goal, agent = method.entry.goal, method.entry.maker

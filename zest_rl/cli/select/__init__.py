@@ -96,7 +96,6 @@ def run(config: Arguments | footage.FootageArguments, ui: Ui) -> dict[str, Any]:
     from functools import partial
 
     from zest_rl.analysis.frame_selection import draw_candidates, score_as_actions, score_as_goals
-    from zest_rl.data import reader
     from zest_rl.kitchen.tasks import get_task
     from zest_rl.kitchen.views import Views
     from zest_rl.metrics import selection
@@ -104,8 +103,8 @@ def run(config: Arguments | footage.FootageArguments, ui: Ui) -> dict[str, Any]:
 
     if not config.datasets:
         raise BadInput("`zest select` needs at least 1 dataset; `zest collect` makes them")
-    task = get_task(config.task or reader.task_name(config.datasets[0]))
     candidates = draw_candidates(config.datasets, config.n_frames, config.seed)
+    task = get_task(config.task or candidates.task[0])
     satisfies = candidates.satisfies(task) if isinstance(config, GoalArguments) else candidates.does(task)
     if satisfies.sum() < config.top:
         raise BadInput(
