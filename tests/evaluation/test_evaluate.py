@@ -149,8 +149,8 @@ def test_the_return_to_go_falls_by_the_score_of_each_new_state(
 ) -> None:
     policy, traces = replay("dt-0", scorer=load_scorer(trained / "dt-0"))
     np.testing.assert_array_equal(np.stack(policy.told, axis=1), traces["score"][:, 1:])
-    scored, _ = load_scorer(trained / "dt-0").score_episodes([traces["qpos"][0]])
-    np.testing.assert_allclose(traces["score"][0], scored[0], atol=1e-5)
+    scored = load_scorer(trained / "dt-0").score_episode(traces["qpos"][0])
+    np.testing.assert_allclose(traces["score"][0], scored, atol=1e-5)
     source = policy.meta["dataset"]["id"]
     np.testing.assert_allclose(traces["score"][0], reader.read_scores(source)[0], atol=1e-5)
     np.testing.assert_array_equal(traces["gt_reward"][0, 1:], reader.read_ground_truth(source)[0].rewards)
