@@ -424,7 +424,7 @@ def test_a_killed_command_goes_on_where_it_stopped_and_ends_with_the_same_datase
     tmp_path: Path, uncut: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     code = (
-        "import sys; from zest_rl import collect; from zest_rl.cli import main\n"
+        "import sys; from zest_rl.kitchen import collect; from zest_rl.cli import main\n"
         f"for name, value in {SMALL}.items(): setattr(collect, name, value)\n"
         "main(sys.argv[1:])"
     )

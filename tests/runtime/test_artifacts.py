@@ -32,7 +32,7 @@ def names(folder: Path) -> set[str]:
 def start(code: str, *arguments: object) -> subprocess.Popen[str]:
     """Run Python code in a process of its own; it has written "ready" when this returns."""
     process = subprocess.Popen(
-        [sys.executable, "-c", f"import os, sys, time\nfrom pathlib import Path\nfrom zest_rl import artifacts\n{code}"]
+        [sys.executable, "-c", f"import os, sys, time\nfrom pathlib import Path\nfrom zest_rl.runtime import artifacts\n{code}"]
         + [str(argument) for argument in arguments],
         stdout=subprocess.PIPE,
         text=True,
@@ -317,7 +317,7 @@ def test_the_git_revision_is_that_of_the_source_tree_or_none(tmp_path: Path, mon
     assert artifacts.git_revision() is None
     git = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c", "-C", str(tmp_path)]
     subprocess.run([*git, "init", "-q"], check=True)
-    package.parent.mkdir()
+    package.parent.mkdir(parents=True)
     package.write_text("1")
     subprocess.run([*git, "add", "."], check=True)
     subprocess.run([*git, "commit", "-qm", "first"], check=True)
