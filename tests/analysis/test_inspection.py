@@ -13,22 +13,26 @@ import numpy as np
 import pytest
 
 from tests.conftest import COLLECTED, collect_some
-from zest_rl.analysis.cross_task import Confusion, confusion, confusion_warnings, inspection_report, labels
-from zest_rl.analysis.inspection import FIGURES, Inspection, inspect, warnings
+from zest_rl.analysis.cross_task import Confusion, confusion, confusion_warnings, inspect_datasets
+from zest_rl.analysis.inspection import Inspection, inspect, labels
+from zest_rl.analysis.reward_figures import FIGURES, warnings
 from zest_rl.data import reader
+from zest_rl.data.provenance import RelabelRecord, ScorerRecord
 from zest_rl.errors import BadInput
 from zest_rl.kitchen import scene
 from zest_rl.kitchen.views import Views
 from zest_rl.metrics import reward_quality, statistics
 from zest_rl.metrics.statistics import Estimate
 from zest_rl.report import render_html
+from zest_rl.report.inspection_page import inspection_report
 from zest_rl.rewards.relabel import relabel_source
 from zest_rl.rewards.scorer import ScorerConfig
 from zest_rl.sources.kitchen import kitchen_source
 
 VIEWS = Views("micro", n_views=1, size=96, tolerance=0.05)
 CONFIG = ScorerConfig("same-scene")
-NEEDS_TRUTH = {figure.name for figure in FIGURES if figure.needs == "truth"}
+NEED_TRUTH = {"spearman", "kendall", "pairwise_accuracy", "auprc", "successes", "epic"}
+NEED_NO_TRUTH = {figure.key for figure in FIGURES} - NEED_TRUTH
 
 
 @pytest.fixture
@@ -45,11 +49,11 @@ def test_figures_are_those_of_the_recorded_scores_and_ground_truth(scored: str) 
     found = inspect(scored)
     returns = np.array([score[1:].sum() for score in reader.read_scores(scored)])
     truth = np.array([episode.episode_return for episode in reader.read_ground_truth(scored)])
-    assert set(found.figures) == {figure.name for figure in FIGURES}
-    assert found.figures["Spearman ρ"] == statistics.spearman(returns, truth)
-    assert found.figures["Pairwise accuracy"] == reward_quality.pairwise_accuracy(returns, truth)
-    assert found.figures["Contradictory"].value == 0
-    assert (found.task, found.has_truth) == ("micro", True)
+    assert set(found.figures) == {figure.key for figure in FIGURES}
+    assert found.figures["spearman"] == statistics.spearman(returns, truth)
+    assert found.figures["pairwise_accuracy"] == reward_quality.pairwise_accuracy(returns, truth)
+    assert found.figures["contradictory"].value == 0
+    assert found.task == "micro"
     scores, success = reader.read_scores(scored), [episode.success for episode in reader.read_ground_truth(scored)]
     for name, wanted in (("successes", True), ("failures", False)):
         group = [score[1:] for score, won in zip(scores, success, strict=True) if won == wanted]
@@ -61,7 +65,7 @@ def test_figures_are_those_of_the_recorded_scores_and_ground_truth(scored: str) 
 def test_scores_of_other_episodes_are_found_out_without_ground_truth(collected: str) -> None:
     shuffled = relabel_source(kitchen_source(collected, VIEWS), CONFIG, shuffle=0, n_workers=1).dataset_id
     found = inspect(shuffled)
-    assert found.figures["Contradictory"].value > 0.01
+    assert found.figures["contradictory"].value > 0.01
     told, seen = (warning for warning in found.warnings if "shuffle" in warning)
     assert "relabeled with --shuffle" in told
     assert "not of these episodes (shuffled?)" in seen
@@ -73,10 +77,10 @@ def test_without_ground_truth_the_rest_is_still_measured(scored: str) -> None:
             del file[name]["infos/gt"]
     (reader.dataset_path(scored) / reader.MANIFEST_FILE).unlink()
     found = inspect(scored)
-    assert set(found.figures) == {figure.name for figure in FIGURES} - NEEDS_TRUTH
+    assert set(found.figures) == NEED_NO_TRUTH
     assert list(found.over_time) == ["all episodes"]
-    assert not found.has_truth
-    page = render_html(inspection_report([found], None, {}, {}))
+    assert found.true_returns is None
+    page = render_html(inspection_report(inspect_datasets([scored], n_workers=1)))
     assert "Contradictory" in page
     assert "Ranking" not in page
 
@@ -88,15 +92,15 @@ SCORES = [np.array([0.0, 0.5, 1.0], np.float32), np.array([0.0, 0.1, 0.2], np.fl
 @pytest.mark.parametrize(
     ("figure", "value", "expected"),
     [
-        ("Contradictory", 0.02, "2% of the frames score otherwise than an equal frame"),
-        ("Told by the step", 0.96, "the reward is a clock"),
-        ("Straight in time", 0.93, "nearly proportional to time"),
-        ("Saturated", 0.96, "most progress is not rewarded"),
-        ("Nothing to see", 0.95, "nothing moves, or the cameras do not see it"),
+        ("contradictory", 0.02, "2% of the frames score otherwise than an equal frame"),
+        ("told_by_step", 0.96, "the reward is a clock"),
+        ("straight_in_time", 0.93, "nearly proportional to time"),
+        ("saturated", 0.96, "most progress is not rewarded"),
+        ("still", 0.95, "nothing moves, or the cameras do not see it"),
     ],
 )
 def test_each_degenerate_reward_has_its_warning(figure: str, value: float, expected: str) -> None:
-    figures = dict.fromkeys((figure.name for figure in FIGURES if figure.needs != "truth"), FINE)
+    figures = dict.fromkeys(NEED_NO_TRUTH, FINE)
     assert warnings(SCORES, figures) == []
     (warning,) = warnings(SCORES, {**figures, figure: Estimate(value, value, value)})
     assert expected in warning
@@ -111,14 +115,14 @@ def test_each_degenerate_reward_has_its_warning(figure: str, value: float, expec
     ],
 )
 def test_returns_that_do_not_rank_the_episodes_are_warned_of(rho: Estimate, expected: str) -> None:
-    figures = {**dict.fromkeys((figure.name for figure in FIGURES), FINE), "Spearman ρ": Estimate(0.9, 0.8, 0.95)}
+    figures = {**dict.fromkeys((figure.key for figure in FIGURES), FINE), "spearman": Estimate(0.9, 0.8, 0.95)}
     assert warnings(SCORES, figures) == []
-    (warning,) = warnings(SCORES, {**figures, "Spearman ρ": rho})
+    (warning,) = warnings(SCORES, {**figures, "spearman": rho})
     assert expected in warning
 
 
 def test_constant_scores_and_constant_returns_are_warned_of() -> None:
-    figures = dict.fromkeys((figure.name for figure in FIGURES if figure.needs != "truth"), FINE)
+    figures = dict.fromkeys(NEED_NO_TRUTH, FINE)
     assert "tell nothing apart" in warnings([np.ones(3, np.float32)] * 3, figures)[0]
     nearly = [np.float32(0.7) + np.float32(1e-6) * score for score in SCORES]
     assert "tell nothing apart" in warnings(nearly, figures)[0]
@@ -133,27 +137,28 @@ def test_differences_are_judged_as_the_trainer_sees_them(collected: str, scored:
     found, level = inspect(differences), inspect(scored)
     last = np.array([score[-1] - score[0] for score in reader.read_scores(differences)])
     truth = np.array([episode.episode_return for episode in reader.read_ground_truth(differences)])
-    assert found.figures["Spearman ρ"].value == pytest.approx(statistics.spearman(last, truth).value)
-    assert found.figures["Contradictory"].value == 0, "levels repeat where states do, differences need not"
-    assert found.figures["Value-order correlation"] != level.figures["Value-order correlation"]
+    assert found.figures["spearman"].value == pytest.approx(statistics.spearman(last, truth).value)
+    assert found.figures["contradictory"].value == 0, "levels repeat where states do, differences need not"
+    assert found.figures["value_order"] != level.figures["value_order"]
     assert labels([found, level]) == ["micro by same-scene, reward difference", "micro by same-scene, reward level"]
 
 
 def test_labels_tell_what_differs() -> None:
-    def made(**changes: Any) -> dict[str, Any]:
-        config = {"goal": "same-scene", "embedder": "e", "features": "delta", "similarity": "cos", "goal_share": 1.0}
-        views = {"n_views": changes.pop("n_views", 8)}
-        reward, shuffle = changes.pop("reward", "level"), changes.pop("shuffle", None)
-        return {"scorer": {"config": {**config, "views": views, **changes}}, "reward": reward, "shuffle": shuffle}
+    def made(**changes: Any) -> RelabelRecord:
+        config = {"goal": "same-scene", "embedder": "e", "features": "delta", "similarity": "cos", "precision": "auto"}
+        rest = {"goal_share": 1.0, "goal_sha256": "", "embedder_sha256": "", "views": {"n_views": 8}}
+        of_scorer = {name: value for name, value in changes.items() if name not in ("reward", "shuffle")}
+        scorer = ScorerRecord(**{**config, **rest, **of_scorer})
+        of_rewards = {name: value for name, value in changes.items() if name not in of_scorer}
+        return RelabelRecord(**{"source": "", "source_sha256": "", "reward": "level", "scorer": scorer, **of_rewards})
 
-    def named(*all_made: dict[str, Any]) -> list[str]:
-        return labels(
-            [Inspection(f"zest/{i}", "micro", one, {}, (), {}, np.zeros(0), None) for i, one in enumerate(all_made)]
-        )
+    def named(*records: RelabelRecord) -> list[str]:
+        nothing = ({}, (), {}, np.zeros(0), None, (0.0, 1.0), None)
+        return labels([Inspection(f"zest/{i}", "micro", record, *nothing) for i, record in enumerate(records)])
 
     assert named(made()) == ["micro by same-scene"]
     assert named(made(), made(goal="/a/b/drawn")) == ["micro by same-scene", "micro by drawn"]
-    assert named(made(), made(features="raw", n_views=1)) == [
+    assert named(made(), made(features="raw", views={"n_views": 1})) == [
         "micro by same-scene, features delta, views 8",
         "micro by same-scene, features raw, views 1",
     ]
@@ -183,7 +188,7 @@ def test_each_goal_scores_the_ends_of_all_tasks_as_their_own_views_show_them(
         ((ids[1], reader.fingerprint(ids[1])), "sdoor"),
     ]
     assert compared.row_names() == ("micro", "sdoor")
-    assert compared.own == (0, 1, 0), "what was relabeled twice is one row"
+    assert compared.own_rows == (0, 1, 0), "what was relabeled twice is one row"
     means = compared.means
     assert means.shape == (2, 3)
     for i, dataset in enumerate(of_two_tasks):

@@ -22,7 +22,7 @@ from zest_rl.cli import reproduce
 from zest_rl.cli.reproduce.plan import TaskData, plan_cells, read_plan
 from zest_rl.data import reader
 from zest_rl.kitchen import collect
-from zest_rl.report import comparison
+from zest_rl.report import methods
 from zest_rl.runtime import artifacts
 
 RECIPE = """
@@ -184,7 +184,7 @@ def test_a_deleted_cell_is_run_again_alone_and_to_the_same_numbers(
     assert result["n_cells_run"] == 1
     assert result["rows"] == whole.result["rows"]
     assert (gone / "model.safetensors").read_bytes() == weights
-    traces = [comparison.latest_evaluation(folder).traces for folder in (gone, cell(whole.output, "dt"))]
+    traces = [methods.latest_evaluation(folder).traces for folder in (gone, cell(whole.output, "dt"))]
     np.testing.assert_array_equal(traces[0]["qpos"], traces[1]["qpos"])
     assert kept.stat().st_mtime_ns == before
 
@@ -433,5 +433,5 @@ def test_a_reproduction_killed_in_training_goes_on_and_ends_with_the_same_bits(
     for method in ("bc", "dt"):
         one, other = (cell(tmp_path / name, method) for name in ("cut", "whole"))
         assert (one / "model.safetensors").read_bytes() == (other / "model.safetensors").read_bytes()
-        traces = [comparison.latest_evaluation(folder).traces for folder in (one, other)]
+        traces = [methods.latest_evaluation(folder).traces for folder in (one, other)]
         np.testing.assert_array_equal(traces[0]["qpos"], traces[1]["qpos"])

@@ -19,19 +19,38 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from markupsafe import escape
 
 from zest_rl.errors import BadInput
 from zest_rl.report import (
+    Caveats,
     Curve,
+    Details,
     EpisodePanel,
+    Episodes,
+    Frames,
     GoalPanel,
+    Goals,
+    LearningCurves,
     Matrix,
     MethodRow,
+    Pixels,
     QualityRow,
     QualityTable,
+    Ranking,
     Report,
+    Results,
+    RewardQuality,
     Scatter,
+    ScoresOverTime,
+    Section,
     Strip,
+    SubGoals,
+    Tasks,
+    TasksAgainstGoals,
+    TaskTable,
+    Views,
+    Warnings,
     render_html,
     write_report,
 )
@@ -67,52 +86,76 @@ def report(video: Path) -> Report:
     image = rng.integers(0, 255, (240, 320, 3), dtype=np.uint8)
     episode = EpisodePanel("an episode", "ZeST+DT", 7, 93.21, True, video, FPS, progress, scores)
     means = np.array([[0.61, 0.2, 0.3], [0.1, 0.43, 0.09]], np.float32)
-    return Report(
-        title="Microwave",
-        summary_sentence="The reward ranks episodes.",
-        table=(
-            MethodRow("ZeST+DT", 62.34, 55.1, 69.0, 63.0, 0.61, 3, 150, paper_value=66.6),
-            MethodRow("shuffled scores", 12.0, 8.0, 15.0, 11.0, 0.1, 3, 150, kind="control", note="must be worse"),
-        ),
-        goals=(
-            GoalPanel("internet images", (image,), (image, image), 0.79, 300),
-            GoalPanel("sentences", ("closed microwave",), ("open microwave",)),
-        ),
-        episodes=(episode, dataclasses.replace(episode, title="not scored", scores=None, success=False)),
-        scatters=(Scatter("delta cos", returns / 2, returns, 0.83, (0.71, 0.9)),),
-        curves=(Curve("BC", "loss", steps, 1 / (1 + steps)), Curve("DT", "loss", steps, steps, steps - 1, steps + 1)),
-        details={"config": {"lr": 1e-4, "folder": Path("runs/a")}},
-        caveats=("three seeds only",),
-        warnings=("the reward is a clock",),
-        quality=QualityTable(
-            ("delta", "raw"),
-            (
-                QualityRow("rank correlation", "1 is best", ((0.71, 0.6, 0.8), None)),
-                QualityRow("a share", "of frames", ((0.25, float("nan"), float("nan")), (0.5, 0.4, 0.6))),
-            ),
-        ),
-        matrix=Matrix(
-            ("door", "knob"), ("delta", "raw", "text"), means, means - np.float32(0.02), means + np.float32(0.03)
-        ),
-        strips=(Strip("the best", (image, image), (0, 30), np.array([0.0, 1.2], np.float32)),),
-        views=(Curve("all views", "score", steps, steps), Curve("view 1", "score", steps, 2 * steps)),
-        pixels=(Scatter("change", steps[:3], steps[:3], 1.0, upward="a score", across="pixels", point="step"),),
-        scores_over_time=(Curve("successes", "mean reward", steps, steps),),
+    rows = (
+        MethodRow("ZeST+DT", 62.34, 55.1, 69.0, 63.0, 0.61, 3, 150, paper_value=66.6),
+        MethodRow("shuffled scores", 12.0, 8.0, 15.0, 11.0, 0.1, 3, 150, kind="control", note="must be worse"),
     )
+    quality = (
+        QualityRow("rank correlation", "1 is best", ((0.71, 0.6, 0.8), None)),
+        QualityRow("a share", "of frames", ((0.25, float("nan"), float("nan")), (0.5, 0.4, 0.6))),
+    )
+    goals = (
+        GoalPanel("internet images", (image,), (image, image), 0.79, 300),
+        GoalPanel("sentences", ("closed microwave",), ("open microwave",)),
+    )
+    pixels = Scatter("change", steps[:3], steps[:3], 1.0, y_name="a score", x_name="pixels", point="step")
+    return Report(
+        "Microwave",
+        "The reward ranks episodes.",
+        (
+            Results(rows),
+            Tasks((TaskTable("one task", rows, "#task"),)),
+            Caveats(("three seeds only",)),
+            Warnings(("the reward is a clock",)),
+            RewardQuality((QualityTable(("delta", "raw"), quality),)),
+            TasksAgainstGoals(
+                (
+                    Matrix(
+                        ("door", "knob"),
+                        ("delta", "raw", "text"),
+                        means,
+                        means - np.float32(0.02),
+                        means + np.float32(0.03),
+                    ),
+                )
+            ),
+            Goals(goals),
+            Ranking((Scatter("delta cos", returns, returns / 2, 0.83, (0.71, 0.9)),)),
+            Frames((Strip("the best", (image, image), (0, 30), np.array([0.0, 1.2], np.float32)),)),
+            Views((Curve("all views", "score", steps, steps), Curve("view 1", "score", steps, 2 * steps))),
+            Pixels((pixels,)),
+            ScoresOverTime((Curve("successes", "mean reward", steps, steps),)),
+            SubGoals((Curve("open", "similarity", steps, steps),)),
+            Episodes((episode, dataclasses.replace(episode, title="not scored", scores=None, success=False))),
+            LearningCurves(
+                (
+                    Curve("BC", "loss", steps, 1 / (1 + steps)),
+                    Curve("DT", "loss", steps, steps, steps - 1, steps + 1),
+                )
+            ),
+            Details((("config", {"lr": 1e-4, "folder": Path("runs/a")}),)),
+        ),
+    )
+
+
+def with_sections(report: Report, *sections: Section[Any]) -> Report:
+    """Return the report with other sections of the same kinds."""
+    new = {type(section): section for section in sections}
+    return dataclasses.replace(report, sections=tuple(new.get(type(old), old) for old in report.sections))
 
 
 def test_every_section_shows_its_content(report: Report) -> None:
     html = render_html(report)
     assert re.findall(r'<section id="([a-z-]+)"', html) == [
-        "results", "caveats", "warnings", "reward-quality", "tasks-against-goals", "goals", "ranking", "frames",
-        "views", "pixels", "scores-over-time", "episodes", "learning-curves", "details",
+        "results", "tasks", "caveats", "warnings", "reward-quality", "tasks-against-goals", "goals", "ranking",
+        "frames", "views", "pixels", "scores-over-time", "sub-goals", "episodes", "learning-curves", "details",
     ]  # fmt: skip
     for text in (
         "Microwave", "The reward ranks episodes.", "62.3\u00a0%", "55.1 to 69.0", "66.6\u00a0%", "must be worse",
         "three seeds only", "<q>open microwave</q>", "ρ = 0.79", "ρ = 0.83", "(0.71 to 0.90), 12 episodes",
         "the reward is a clock", "rank correlation", "<b>0.71</b>", "0.60 to 0.80", "<b>0.61</b>", "<b>0.43</b>",
         "the best", "step 30", 'width="100%"', "A score ↑", "Pixels →", "step 2: a score", "mean reward",
-        "✓ success", "✕ no success", "evaluation only", "&quot;folder&quot;: &quot;runs/a&quot;",
+        "✓ success", "✕ no success", "evaluation only", "&#34;folder&#34;: &#34;runs/a&#34;",
     ):  # fmt: skip
         assert text in html, text
     assert html.count('class="point"') == 12 + 3
@@ -123,8 +166,8 @@ def test_every_section_shows_its_content(report: Report) -> None:
 def test_a_matrix_has_a_row_per_task_and_the_highest_of_each_goal_in_bold(report: Report) -> None:
     (table,) = re.findall(r"<table>(?:(?!</table>).)*by the goal of.*?</table>", render_html(report), re.DOTALL)
     assert re.findall(r'<th scope="col" class="num">(.*?)</th>', table) == ["delta", "raw", "text"]
-    rows = re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', table)
-    cell = r'data-label="(.*?)">(.*?)<span class="note">(.*?)</span></td>'
+    rows = re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', table, re.DOTALL)
+    cell = r'data-label="(.*?)">(.*?)\s*<span class="note">(.*?)</span></td>'
     assert [(name, re.findall(cell, cells)) for name, cells in rows] == [
         (
             "door",
@@ -153,9 +196,9 @@ def test_an_empty_report_has_no_sections() -> None:
 
 
 def test_the_column_of_the_papers_figures_appears_only_with_figures(report: Report) -> None:
-    rows = tuple(dataclasses.replace(row, paper_value=None) for row in report.table)
-    assert 'data-label="Paper"' in render_html(report)
-    assert 'data-label="Paper"' not in render_html(dataclasses.replace(report, table=rows))
+    rows = tuple(dataclasses.replace(row, paper_value=None) for row in report.items(Results))
+    assert 'data-label="Paper"' in render_html(Report("t", "s", (Results(report.items(Results)),)))
+    assert 'data-label="Paper"' not in render_html(Report("t", "s", (Results(rows),)))
 
 
 def test_nothing_outside_the_file_is_referred_to(report: Report) -> None:
@@ -167,16 +210,19 @@ def test_nothing_outside_the_file_is_referred_to(report: Report) -> None:
     assert "unsafe" not in html
 
 
-def test_text_from_outside_is_escaped_everywhere(report: Report) -> None:
-    evil = "\"><script>alert('$title')</script>"
+def test_a_hostile_string_in_any_text_of_a_report_is_shown_escaped(report: Report) -> None:
+    hostile: list[str] = []
 
     def spoil(value: Any) -> Any:
         if isinstance(value, str):
-            return value if value in ("method", "control", "dataset") else evil
+            if value in ("method", "control", "dataset"):
+                return value
+            hostile.append(f"\"><script>alert('{len(hostile)} {{{{ title }}}}')</script>")
+            return hostile[-1]
         if isinstance(value, tuple):
             return tuple(spoil(item) for item in value)
         if isinstance(value, dict):
-            return {evil: evil}
+            return {spoil(key): spoil(item) for key, item in value.items()}
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             return dataclasses.replace(
                 value, **{f.name: spoil(getattr(value, f.name)) for f in dataclasses.fields(value)}
@@ -185,25 +231,28 @@ def test_text_from_outside_is_escaped_everywhere(report: Report) -> None:
 
     html = render_html(spoil(report))
     assert html.count("<script") == 1
-    assert evil not in html
-    assert html.count("&quot;&gt;&lt;script&gt;alert(&#x27;$title&#x27;)&lt;/script&gt;") > 20
+    assert len(hostile) > 50
+    for text in hostile:
+        assert text not in html
+        as_json = text.replace('"', '\\"')  # keys and values of details are JSON first
+        assert str(escape(text)) in html or str(escape(as_json)) in html, text
 
 
 def test_figures_that_are_not_finite_are_shown_as_a_dash(report: Report) -> None:
     nan, inf = float("nan"), float("inf")
     scores = np.full(N_STEPS + 1, nan, np.float32)
     scores[3:9] = 0.5
-    broken = dataclasses.replace(
+    broken = with_sections(
         report,
-        table=(MethodRow("not run", nan, nan, nan, inf, nan, 0, 0, paper_value=nan),),
-        goals=(dataclasses.replace(report.goals[0], spearman=nan),),
-        episodes=(dataclasses.replace(report.episodes[0], scores=scores, normalized_return=nan),),
-        scatters=(Scatter("s", np.array([1, nan, 2], np.float32), np.array([1, 2, inf], np.float32), nan, (nan, nan)),),
-        curves=(Curve("BC", "loss", np.zeros(2, np.float32), np.full(2, nan, np.float32)),),
-        details={"config": {"target": nan, "limits": [inf, np.float32("nan")], "array": np.array([nan])}},
-        quality=QualityTable(("d",), (QualityRow("q", "m", ((nan, nan, inf),)),)),
-        matrix=Matrix(("d",), ("d",), *np.full((3, 1, 1), nan, np.float32)),
-        strips=(dataclasses.replace(report.strips[0], scores=np.array([nan, inf], np.float32)),),
+        Results((MethodRow("not run", nan, nan, nan, inf, nan, 0, 0, paper_value=nan),)),
+        Goals((dataclasses.replace(report.items(Goals)[0], spearman=nan),)),
+        Episodes((dataclasses.replace(report.items(Episodes)[0], scores=scores, normalized_return=nan),)),
+        Ranking((Scatter("s", np.array([1, 2, inf], np.float32), np.array([1, nan, 2], np.float32), nan, (nan, nan)),)),
+        LearningCurves((Curve("BC", "loss", np.zeros(2, np.float32), np.full(2, nan, np.float32)),)),
+        Details((("config", {"target": nan, "limits": [inf, np.float32("nan")], "array": np.array([nan])}),)),
+        RewardQuality((QualityTable(("d",), (QualityRow("q", "m", ((nan, nan, inf),)),)),)),
+        TasksAgainstGoals((Matrix(("d",), ("d",), *np.full((3, 1, 1), nan, np.float32)),)),
+        Frames((dataclasses.replace(report.items(Frames)[0], scores=np.array([nan, inf], np.float32)),)),
     )
     html = render_html(broken)
     text = re.sub(r"base64,[^\"]*|<style>.*?</style>|<script>.*?</script>", "", html, flags=re.DOTALL)
@@ -229,13 +278,13 @@ def test_the_page_depends_on_the_report_alone(report: Report) -> None:
 
 def test_goal_images_are_embedded_as_thumbnails() -> None:
     wide = GoalPanel("wide", (np.zeros((800, 1600, 3), np.uint8),), ("open",))
-    encoded = re.findall(r'src="data:image/png;base64,([^"]*)"', render_html(Report("t", "s", goals=(wide,))))
+    encoded = re.findall(r'src="data:image/png;base64,([^"]*)"', render_html(Report("t", "s", (Goals((wide,)),))))
     assert imageio.imread(base64.b64decode(encoded[0])).shape == (80, 160, 3)
 
 
 def test_a_video_that_browsers_cannot_play_is_refused(report: Report, tmp_path: Path) -> None:
     def with_video(path: Path) -> Report:
-        return dataclasses.replace(report, episodes=(dataclasses.replace(report.episodes[0], video=path),))
+        return with_sections(report, Episodes((dataclasses.replace(report.items(Episodes)[0], video=path),)))
 
     with pytest.raises(BadInput, match=r"mpeg4\.mp4 must be an MP4 file with H\.264 video"):
         render_html(with_video(write_video(tmp_path / "mpeg4.mp4", codec="mpeg4")))
@@ -244,7 +293,7 @@ def test_a_video_that_browsers_cannot_play_is_refused(report: Report, tmp_path: 
 
 
 def test_parts_that_do_not_fit_together_are_refused(report: Report) -> None:
-    episode = report.episodes[0]
+    episode = report.items(Episodes)[0]
     three, four = np.zeros(3, np.float32), np.zeros(4, np.float32)
     with pytest.raises(
         BadInput, match="an episode: scores and gt_progress must be equally long, got scores 3, gt_prog"
@@ -254,7 +303,7 @@ def test_parts_that_do_not_fit_together_are_refused(report: Report) -> None:
         dataclasses.replace(episode, fps=0)
     with pytest.raises(BadInput, match="at least 2 frames, got 1"):
         dataclasses.replace(episode, gt_progress=three[:1], scores=None)
-    with pytest.raises(BadInput, match="got zest_returns 3, gt_returns 4"):
+    with pytest.raises(BadInput, match="got x 3, y 4"):
         Scatter("s", three, four, 0.0)
     with pytest.raises(BadInput, match=r"2 sources and 1 goals must have shape \(2, 1\), got \(1, 2\)"):
         Matrix(("door", "knob"), ("delta",), *np.zeros((3, 1, 2), np.float32))

@@ -1,4 +1,4 @@
-"""One episode of a relabeled dataset → what a person looks at: a strip of frames with their scores, and each view's."""
+"""One episode → what a person looks at: a strip of frames with their scores, and each view's."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.analysis.inspection import Inspection
+from zest_rl.data.reader import dataset_path
 from zest_rl.data.video import evenly_spaced
 from zest_rl.kitchen.views import canonical_states
+from zest_rl.rewards.relabel import SCORER_FILE
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.types import FloatArray
 
@@ -18,8 +21,8 @@ N_FRAMES = 8
 
 
 @dataclass(frozen=True)
-class Look:
-    """How the score sees one episode; what is not looked at is neither rendered nor scored."""
+class EpisodeView:
+    """How the score sees one episode; what nobody asks for is neither rendered nor scored."""
 
     scorer: StateScorer
     """Of the dataset."""
@@ -59,3 +62,22 @@ class Look:
         views = self.scorer.embedder.config.views
         distinct, index = np.unique(canonical_states(states, views), axis=0, return_inverse=True)
         return np.stack([views.shared_renderer().render(state) for state in distinct]), index.reshape(-1)
+
+
+def best_and_worst(inspection: Inspection, *, n_workers: int | None = None) -> dict[str, EpisodeView]:
+    """Return views of the episodes with the highest and the lowest return: "best" and "worst".
+
+    None where scores were shuffled, or where the frames were not rendered by us.
+
+    Args:
+        inspection: of a dataset.
+        n_workers: processes that embed, default one per core.
+
+    Raises:
+        ZestError: the scorer is gone, or was made with another embedder or renderer than the ones here.
+    """
+    if inspection.made.shuffle is not None or inspection.states is None:
+        return {}
+    scorer = StateScorer.load(dataset_path(inspection.dataset_id) / SCORER_FILE, n_workers=n_workers)
+    chosen = {"best": np.argmax(inspection.returns), "worst": np.argmin(inspection.returns)}
+    return {which: EpisodeView(scorer, inspection.states[int(index)]) for which, index in chosen.items()}

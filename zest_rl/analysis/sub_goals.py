@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.analysis.clip_selection import Clip, embed_clips
-from zest_rl.analysis.episode_view import N_FRAMES, Look
+from zest_rl.analysis.episode_view import N_FRAMES, EpisodeView
 from zest_rl.data.images import read_image
 from zest_rl.data.video import evenly_spaced, read_frames
 from zest_rl.embedders import Embedder
@@ -83,8 +83,8 @@ def score_performance(
     """
     sub_goals = []
     for task, done_at in performance.done_at.items():
-        look = Look(build_scorer(task), performance.states)
-        sub_goals.append(SubGoalScores(task, look.scores, tuple(look.frames), look.steps, done_at))
+        view = EpisodeView(build_scorer(task), performance.states)
+        sub_goals.append(SubGoalScores(task, view.scores, tuple(view.frames), view.steps, done_at))
         on_done()
     return sub_goals
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from zest_rl.cli.ui import Ui
+from zest_rl.cli.ui import Ui, progress_in_parts
 
 
 @dataclass(frozen=True)
@@ -28,67 +28,19 @@ class Config:
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Measure, warn, write the page."""
-    import numpy as np
-
-    from zest_rl.analysis.cross_task import confusion, confusion_warnings, inspection_report, labels, look_at
-    from zest_rl.analysis.inspection import inspect
-    from zest_rl.errors import BadInput, ZestError
+    from zest_rl.analysis.cross_task import inspect_datasets
     from zest_rl.report import write_report
+    from zest_rl.report.inspection_page import inspection_report
 
-    if not config.datasets:
-        raise BadInput("`zest inspect` needs at least 1 dataset; `zest relabel` makes them")
-    ids = tuple(dict.fromkeys(config.datasets))
-    inspections = []
-    with ui.progress("datasets", len(ids)) as advance:
-        for dataset in ids:
-            inspections.append(inspect(dataset))
-            advance()
-    warnings = {one.dataset_id: list(one.warnings) for one in inspections}
-    looks = {}
-    with ui.progress("episodes to look at", len(ids)) as advance:
-        for one in inspections:
-            try:
-                looks[one.dataset_id] = look_at(one, n_workers=config.n_workers)
-            except ZestError as error:
-                ui.warn(f"no episode of {one.dataset_id} is shown: {error}")
-            advance()
-    compared = None
-    if len({one.task for one in inspections}) > 1:
-        try:
-            with ui.progress("goals against tasks", len(ids)) as advance:
-                compared = confusion(inspections, n_workers=config.n_workers, on_done=advance)
-        except ZestError as error:
-            ui.warn(f"goals were not compared across tasks: {error}")
-        else:
-            for dataset, warning in confusion_warnings(inspections, compared).items():
-                warnings[dataset].append(warning)
-    for dataset, found in warnings.items():
-        for warning in found:
-            ui.warn(f"{dataset}: {warning}")
-    page = write_report(inspection_report(inspections, compared, warnings, looks), config.output)
-    return {
-        "datasets": {
-            one.dataset_id: {
-                "label": label,
-                "figures": {
-                    name: None if estimate is None else estimate.as_json()
-                    for name, estimate in one.known_figures().items()
-                },
-            }
-            for label, one in zip(labels(inspections), inspections, strict=True)
-        },
-        "warnings": warnings,
-        "goals_against_tasks": None
-        if compared is None
-        else {
-            "episodes_of": [source for source, _ in compared.sources],
-            "by_goal_of": list(ids),
-            "mean_scores": compared.means.tolist(),
-            "ci95": np.stack([compared.low, compared.high], axis=-1).tolist(),
-        },
-        "report": str(page),
-        "next": f"open {page} in a browser",
-    }
+    with progress_in_parts(ui, "inspecting") as on_progress:
+        inspected = inspect_datasets(config.datasets, n_workers=config.n_workers, on_progress=on_progress)
+    for sentence in inspected.left_out:
+        ui.warn(sentence)
+    for dataset, sentences in inspected.warnings.items():
+        for sentence in sentences:
+            ui.warn(f"{dataset}: {sentence}")
+    page = write_report(inspection_report(inspected), config.output)
+    return {**inspected.to_json(), "report": str(page), "next": f"open {page} in a browser"}
 
 
 def summary(result: Mapping[str, Any]) -> str:

@@ -25,29 +25,13 @@ class Config:
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Group the runs by method, build the report, write it."""
-    from zest_rl.data import reader
-    from zest_rl.errors import BadInput
-    from zest_rl.report import write_report
-    from zest_rl.report.comparison import compare, goal_name, methods_of_runs, read_meta
+    from zest_rl.report import Results, write_report
+    from zest_rl.report.comparison_page import compare_runs
 
-    if not config.runs:
-        raise BadInput("`zest report` needs at least 1 run folder; `zest train` and `zest evaluate` make them")
-    methods = methods_of_runs(tuple(dict.fromkeys(config.runs)))
-    goals: dict[str, str] = {}
-    sources: set[str] = set()
-    for folder in config.runs:
-        meta = read_meta(folder)
-        dataset, goal = meta["dataset"]["id"], goal_name(meta)
-        sources.add(dataset if goal is None else meta["dataset"]["zest"]["relabel"]["source"])
-        if goal is not None and reader.exists(dataset) and goals.setdefault(goal, dataset) != dataset:
-            goals[f"{goal} ({dataset})"] = dataset
-    source = sources.pop() if len(sources) == 1 else None
-    report = compare(
-        config.title, methods, source_id=source if source is not None and reader.exists(source) else None, goals=goals
-    )
+    report = compare_runs(config.runs, title=config.title)
     path = write_report(report, config.output)
     return {
         "report": str(path),
-        "rows": {row.method: round(row.mean, 2) for row in report.table},
+        "rows": {row.method: round(row.mean, 2) for row in report.items(Results)},
         "next": f"open {path} in a browser",
     }

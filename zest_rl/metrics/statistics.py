@@ -14,6 +14,8 @@ Values = NDArray[np.float64]
 Statistic = Callable[[Values], Values]
 N_RESAMPLES, BLOCK = 10_000, 200
 """Bootstrap samples, and how many are in memory at a time."""
+MIN_EPISODES_TO_RANK = 3
+"""Fewer have no rank correlation worth telling."""
 
 
 @dataclass(frozen=True)

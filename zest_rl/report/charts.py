@@ -1,4 +1,4 @@
-"""Charts as SVG strings: pure functions, no styling (that is `style.css`), no units but percent of the plot.
+"""Charts as SVG: pure functions, no styling (that is `style.css`), no units but percent of the plot.
 
 Positions are percentages, so a chart fills whatever width it gets while text, dots and strokes keep their size; the
 tick labels stand in the padding that `style.css` gives to ``svg.chart``.
@@ -10,15 +10,17 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from html import escape
 
 import numpy as np
+from markupsafe import Markup
 
-from zest_rl.report.content import MethodRow, Scatter
+from zest_rl.report.content import Curve, EpisodePanel, MethodRow, Scatter
 from zest_rl.types import FloatArray
 
 MISSING = "–"
 """What stands where a figure is not finite."""
+N_LINE_STYLES = 6
+"""Line styles in `style.css`; a chart with more curves repeats them."""
 
 
 def number(value: float | None, digits: int = 2) -> str:
@@ -83,7 +85,20 @@ def _y_ticks(y: Axis) -> str:
     return "".join(parts)
 
 
-def interval_bar(row: MethodRow, axis: Axis) -> str:
+def _image(style: str, label: str, parts: Iterable[str], **data: object) -> Markup:
+    """Return an SVG with what a screen reader says of it; `parts` are markup."""
+    extra = Markup("").join(Markup(' data-{}="{}"').format(name, value) for name, value in data.items())
+    head = Markup('<svg class="{}" role="img" aria-label="{}"{}>').format(style, label, extra)
+    return head + Markup("".join(parts)) + Markup("</svg>")
+
+
+def results_axis(rows: Sequence[MethodRow]) -> Axis:
+    """Return the axis that the bars of a table share; it holds 0 % and 100 %."""
+    figures = [v for row in rows for v in (row.mean, row.ci_low, row.ci_high, row.paper_value) if v is not None]
+    return axis_over([0, 100, *figures], 5, 0.02)
+
+
+def interval_bar(row: MethodRow, axis: Axis) -> Markup:
     """Return the mean as a dot on its 95 % interval, with the paper's figure as a diamond below it."""
     parts = [f'<line class="grid" x1="{axis.percent(t):.2f}%" x2="{axis.percent(t):.2f}%" y1="0" y2="100%"/>'
              for t in axis.ticks]  # fmt: skip
@@ -97,22 +112,28 @@ def interval_bar(row: MethodRow, axis: Axis) -> str:
         at = f"{axis.percent(row.paper_value):.2f}%"
         parts.append(f'<svg x="{at}" y="50%" overflow="visible"><path class="paper" d="M0 7l5 5l-5 5l-5-5Z"/></svg>')
         label += f"; the paper {number(row.paper_value, 1)} %"
-    return f'<svg class="bar {row.kind}" role="img" aria-label="{escape(label)}">{"".join(parts)}</svg>'
+    return _image(f"bar {row.kind}", label, parts)
 
 
-def axis_labels(axis: Axis) -> str:
+def axis_labels(axis: Axis) -> Markup:
     """Return the tick labels that stand above a column of `interval_bar`."""
     ticks = "".join(
         f'<text x="{axis.percent(t):.2f}%" y="1em" class="x tick">{axis.label(t)}</text>' for t in axis.ticks
     )
-    return f'<svg class="bar-axis" aria-hidden="true">{ticks}</svg>'
+    return Markup(f'<svg class="bar-axis" aria-hidden="true">{ticks}</svg>')
 
 
-def correlation_gauge(value: float) -> str:
+def level_bar(score: float) -> Markup:
+    """Return a bar that is filled up to `score`, from 0 to 1."""
+    width = f"{100 * min(max(float(score), 0), 1):.0f}%" if math.isfinite(score) else "0"
+    return Markup(f'<svg class="level"><rect width="{width}" height="100%" rx="3"/></svg>')
+
+
+def correlation_gauge(value: float) -> Markup:
     """Return a correlation as a dot between −1 and 1."""
     axis = Axis(-1, 1, (-1, 0, 1))
     at, zero = axis.percent(value), axis.percent(0)
-    return (
+    return Markup(
         '<svg class="gauge" aria-hidden="true"><line class="rail" x1="0" x2="100%" y1="50%" y2="50%"/>'
         f'<line class="ci" x1="{zero:.2f}%" x2="{at:.2f}%" y1="50%" y2="50%"/>'
         f'<line class="zero" x1="{zero:.2f}%" x2="{zero:.2f}%" y1="15%" y2="85%"/>'
@@ -120,21 +141,17 @@ def correlation_gauge(value: float) -> str:
     )
 
 
-def scatter_chart(scatter: Scatter) -> str:
-    """Return one dot per episode with a hover title, ground truth across, ZeST upward; only finite pairs."""
-    finite = np.flatnonzero(np.isfinite(scatter.gt_returns) & np.isfinite(scatter.zest_returns))
-    x, y = axis_over(scatter.gt_returns[finite], 4, 0.05), axis_over(scatter.zest_returns[finite], 6, 0.05)
-    point, upward, across = (escape(text) for text in (scatter.point, scatter.upward, scatter.across))
+def scatter_chart(scatter: Scatter) -> Markup:
+    """Return one dot per finite point, with a hover title."""
+    x, y = axis_over(scatter.x[scatter.shown], 4, 0.05), axis_over(scatter.y[scatter.shown], 6, 0.05)
+    dot = Markup('<circle class="point" cx="{:.2f}%" cy="{:.2f}%" r="4"><title>{} {}: {} {}, {} {}</title></circle>')
     dots = []
-    for i in finite:
-        gt, zest = float(scatter.gt_returns[i]), float(scatter.zest_returns[i])
-        dots.append(
-            f'<circle class="point" cx="{x.percent(gt):.2f}%" cy="{100 - y.percent(zest):.2f}%" r="4">'
-            f"<title>{point} {i}: {upward} {number(zest)}, {across} {number(gt)}</title></circle>"
-        )
-    label = f"{scatter.name}: {len(finite)} {scatter.point}s, Spearman {number(scatter.spearman)}"
-    marks = _x_ticks(x) + _y_ticks(y) + "".join(dots)
-    return f'<svg class="chart square" role="img" aria-label="{escape(label)}">{marks}</svg>'
+    for i in scatter.shown:
+        across, up = float(scatter.x[i]), float(scatter.y[i])
+        title = (scatter.point, i, scatter.y_name, number(up), scatter.x_name, number(across))
+        dots.append(dot.format(x.percent(across), 100 - y.percent(up), *title))
+    label = f"{scatter.name}: {len(dots)} {scatter.point}s, Spearman {number(scatter.spearman)}"
+    return _image("chart square", label, [_x_ticks(x), _y_ticks(y), *dots])
 
 
 @dataclass(frozen=True)
@@ -173,9 +190,15 @@ def _band(line: Line, x: Axis, y: Axis) -> str:
     return f'<polygon class="band {line.style}" points="{points}"/>'
 
 
-def line_key(style: str) -> str:
+def line_styles(n: int, first_alone: bool) -> list[str]:
+    """Return the CSS classes of `n` curves; with `first_alone` all but the first are faint and alike."""
+    return ["faint" if first_alone and i else f"c{i % N_LINE_STYLES}" for i in range(n)]
+
+
+def line_key(style: str) -> Markup:
     """Return a short sample of a line for a legend."""
-    return f'<svg class="key" aria-hidden="true"><line class="line {style}" x1="1" x2="27" y1="50%" y2="50%"/></svg>'
+    line = f'<line class="line {style}" x1="1" x2="27" y1="50%" y2="50%"/>'
+    return Markup(f'<svg class="key" aria-hidden="true">{line}</svg>')
 
 
 def line_chart(
@@ -185,7 +208,7 @@ def line_chart(
     y_holds: Sequence[float] = (),
     scrub: bool = False,
     show_x: bool = True,
-) -> str:
+) -> Markup:
     """Return lines over a common axis.
 
     Args:
@@ -202,15 +225,45 @@ def line_chart(
     bands = "".join(_band(line, x, y) for line in lines)
     paths = "".join(f'<path class="line {line.style}" d="{_path(line, x, y)}"/>' for line in lines)
     plot = f'<svg viewBox="0 0 100 100" preserveAspectRatio="none" overflow="visible">{bands}{paths}</svg>'
-    data = ""
+    data: dict[str, object] = {}
     if scrub:
         values = [round(float(v), 4) if math.isfinite(v) else None for v in lines[0].y]
-        data = f' data-low="{y.low}" data-high="{y.high}" data-values="{json.dumps(values, allow_nan=False)}"'
+        data = {"low": y.low, "high": y.high, "values": json.dumps(values, allow_nan=False)}
         plot += (
             '<line class="cursor" x1="0" x2="0" y1="0" y2="100%"/>'
             f'<circle class="dot {lines[0].style}" cx="0" cy="100%" r="5" visibility="hidden"/>'
             '<rect class="hit" width="100%" height="100%"/>'
         )
-    height = "tall" if tall else "low"
-    grid = _y_ticks(y) + (_x_ticks(x) if show_x else "")
-    return f'<svg class="chart {height}" role="img" aria-label="{escape(label)}"{data}>{grid}{plot}</svg>'
+    ticks = _y_ticks(y) + (_x_ticks(x) if show_x else "")
+    return _image(f"chart {'tall' if tall else 'low'}", label, [ticks, plot], **data)
+
+
+def curve_chart(quantity: str, curves: Sequence[Curve], styles: Sequence[str]) -> Markup:
+    """Return curves of one quantity, each with its band where it has one."""
+    lines = [Line(c.steps, c.values, style, c.band) for c, style in zip(curves, styles, strict=True)]
+    return line_chart(lines, f"{quantity} of {', '.join(curve.name for curve in curves)}")
+
+
+def score_range(panels: Iterable[EpisodePanel]) -> tuple[float, float]:
+    """Return the lowest and the highest finite score of all episodes, and 0 within."""
+    scores = [panel.scores[np.isfinite(panel.scores)] for panel in panels if panel.scores is not None]
+    every = np.concatenate([*scores, np.zeros(1)])
+    return float(every.min()), float(every.max())
+
+
+def score_chart(panel: EpisodePanel, y_holds: tuple[float, float]) -> Markup:
+    """Return the scores of an episode, on an axis that those of others share."""
+    assert panel.scores is not None
+    label = f"ZeST score over {len(panel.scores) - 1} steps of {panel.title}"
+    line = Line(np.arange(len(panel.scores), dtype=np.float32), panel.scores, "score")
+    return line_chart([line], label, y_holds=y_holds, scrub=True, show_x=False)
+
+
+def progress_chart(panel: EpisodePanel) -> Markup:
+    """Return the ground-truth progress of an episode, and that of the one beside it."""
+    steps = np.arange(len(panel.gt_progress), dtype=np.float32)
+    lines = [Line(steps, panel.gt_progress, "gt")]
+    if panel.beside is not None:
+        lines.append(Line(steps, panel.beside[1], "c1"))
+    label = f"Ground-truth progress over {len(steps) - 1} steps of {panel.title}"
+    return line_chart(lines, label, tall=False, y_holds=(0, 1), scrub=True)

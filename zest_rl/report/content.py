@@ -1,4 +1,4 @@
-"""What a report says: frozen dataclasses, checked where they are built.
+"""What the sections of a report are made of: frozen dataclasses, checked where they are built.
 
 Returns are normalized: 100 % is the expert, 0 % is the robot that does nothing. A figure that could not be computed is
 NaN and is shown as "–".
@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zest_rl.errors import BadInput, nearest
 from zest_rl.types import FloatArray, Frame
@@ -116,36 +117,42 @@ class EpisodePanel:
 
 @dataclass(frozen=True)
 class Scatter:
-    """ZeST return against ground-truth return, one point for each episode of a dataset; or what else the names say."""
+    """One point for each episode of a dataset, or for whatever `point` names."""
 
     name: str
-    zest_returns: FloatArray
+    x: FloatArray
     """(n,) float32."""
-    gt_returns: FloatArray
+    y: FloatArray
     """(n,) float32."""
     spearman: float
-    """Rank correlation, in [-1, 1]."""
+    """Rank correlation of `x` and `y`, in [-1, 1]."""
     ci: tuple[float, float] | None = None
     """95 % confidence interval of `spearman`."""
-    upward: str = "ZeST return"
-    across: str = "ground-truth return"
+    x_name: str = "ground-truth return"
+    y_name: str = "ZeST return"
     point: str = "episode"
 
     def __post_init__(self) -> None:
-        _check_equal_lengths(self.name, {"zest_returns": len(self.zest_returns), "gt_returns": len(self.gt_returns)})
+        _check_equal_lengths(self.name, {"x": len(self.x), "y": len(self.y)})
+
+    @property
+    def shown(self) -> NDArray[np.intp]:
+        """(m,) indices of the points that are finite, which alone are drawn."""
+        return np.flatnonzero(np.isfinite(self.x) & np.isfinite(self.y))
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One line of a learning curve, or of scores over time; curves of the same quantity share a chart."""
+    """One line over gradient steps, or over the steps of an episode; curves of the same quantity share a chart."""
 
-    method: str
+    name: str
+    """What the legend calls it: a method, a view, a group of episodes."""
     quantity: str
     """What is drawn upward, with its unit: `validation loss`."""
     steps: FloatArray
-    """(n,) float32, gradient steps (or an episode's steps)."""
+    """(n,) float32."""
     values: FloatArray
-    """(n,) float32, the mean over seeds."""
+    """(n,) float32."""
     low: FloatArray | None = None
     """(n,) float32, lower edge of the band around `values`; needs `high`."""
     high: FloatArray | None = None
@@ -153,17 +160,22 @@ class Curve:
 
     def __post_init__(self) -> None:
         if (self.low is None) != (self.high is None):
-            raise BadInput(f"{self.method}: a band needs both low and high, got one of them; pass both or neither")
+            raise BadInput(f"{self.name}: a band needs both low and high, got one of them; pass both or neither")
         arrays = {"steps": self.steps, "values": self.values, "low": self.low, "high": self.high}
-        _check_equal_lengths(self.method, {name: len(a) for name, a in arrays.items() if a is not None})
+        _check_equal_lengths(self.name, {name: len(a) for name, a in arrays.items() if a is not None})
+
+    @property
+    def band(self) -> tuple[FloatArray, FloatArray] | None:
+        """Lower and upper edge, where there are both."""
+        return None if self.low is None or self.high is None else (self.low, self.high)
 
 
 @dataclass(frozen=True)
-class Section:
-    """The table of one task within a report over several."""
+class TaskTable:
+    """The results of one task within a report over several."""
 
-    title: str
-    table: tuple[MethodRow, ...]
+    task: str
+    rows: tuple[MethodRow, ...]
     page: str
     """File name, beside the report, of the task's own report."""
 
@@ -228,31 +240,7 @@ class Matrix:
                     f"a matrix of {shape[0]} sources and {shape[1]} goals must have shape {shape}, got {values.shape}"
                 )
 
-
-@dataclass(frozen=True)
-class Report:
-    """Everything one HTML file shows. Empty sections are left out."""
-
-    title: str
-    summary_sentence: str
-    table: tuple[MethodRow, ...] = ()
-    sections: tuple[Section, ...] = ()
-    warnings: tuple[str, ...] = ()
-    quality: QualityTable | None = None
-    matrix: Matrix | None = None
-    goals: tuple[GoalPanel, ...] = ()
-    episodes: tuple[EpisodePanel, ...] = ()
-    scatters: tuple[Scatter, ...] = ()
-    strips: tuple[Strip, ...] = ()
-    views: tuple[Curve, ...] = ()
-    """Scores of one episode by each view."""
-    pixels: tuple[Scatter, ...] = ()
-    """Scores against how many pixels change."""
-    scores_over_time: tuple[Curve, ...] = ()
-    """Mean scores; their `steps` are those of an episode."""
-    sub_goals: tuple[Curve, ...] = ()
-    """Scores of one episode by each of its sub-goals."""
-    curves: tuple[Curve, ...] = ()
-    details: Mapping[str, object] = field(default_factory=dict)
-    """Configs, versions, provenance: name → anything that reads as JSON; each is a collapsed block."""
-    caveats: tuple[str, ...] = ()
+    @property
+    def highest(self) -> NDArray[np.intp]:
+        """(n_goals,) the row that each goal scores highest."""
+        return np.asarray(self.values.argmax(axis=0))

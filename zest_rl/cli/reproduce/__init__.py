@@ -33,7 +33,7 @@ from zest_rl.cli.ui import SilentUi, Ui
 if TYPE_CHECKING:
     from zest_rl.kitchen.videos import Video
     from zest_rl.report import MethodRow, Report
-    from zest_rl.report.comparison import Method
+    from zest_rl.report.methods import Method
 
 POLL_SECONDS = 2.0
 
@@ -67,7 +67,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 def _run(config: Config, ui: Ui) -> dict[str, Any]:
     from zest_rl.kitchen.videos import ensure_videos, missing
     from zest_rl.report import write_report
-    from zest_rl.report.comparison import overview
+    from zest_rl.report.comparison_page import overview
     from zest_rl.runtime import artifacts
 
     output = config.output or Path("runs") / config.file.stem
@@ -154,18 +154,19 @@ def _result(
     output: Path,
 ) -> dict[str, Any]:
     """What is written to result.json."""
+    from zest_rl.report import Ranking, Results
     from zest_rl.runtime import artifacts
 
     return {
-        "rows": _rows(report.table),
+        "rows": _rows(report.items(Results)),
         "tasks": {
             task: {
-                "rows": _rows(page.table),
+                "rows": _rows(page.items(Results)),
                 "spearman_of_zest_and_true_returns": {
                     scatter.name: None
                     if math.isnan(scatter.spearman)
                     else {"value": scatter.spearman, "ci95": scatter.ci}
-                    for scatter in page.scatters
+                    for scatter in page.items(Ranking)
                 },
                 "dataset": collected[task],
             }
@@ -193,7 +194,7 @@ def _make_datasets(plan: Plan, task: str, collect_config: Any, n_workers: int | 
 
 
 def _methods(plan: Plan, cells: list[Cell], task: str) -> list[Method]:
-    from zest_rl.report.comparison import Method
+    from zest_rl.report.methods import Method
 
     return [
         Method(
@@ -212,7 +213,7 @@ def _task_report(
     plan: Plan, task: str, methods: list[Method], datasets: TaskData, details: dict[str, Any], videos: list[Video]
 ) -> Report:
     """Compare the methods on one task; `videos` takes up those that the report shows and somebody has yet to write."""
-    from zest_rl.report.comparison import compare
+    from zest_rl.report.comparison_page import compare
 
     def film(video: Video) -> Path:
         videos.append(video)

@@ -252,7 +252,7 @@ def markdown(result: Mapping[str, Any]) -> str:
 
 def study_report(result: Mapping[str, Any], caveats: tuple[str, ...]) -> Any:
     """Build the page: the same tables, with intervals."""
-    from zest_rl.report import QualityRow, QualityTable, Report
+    from zest_rl.report import Caveats, Details, QualityRow, QualityTable, Report, RewardQuality
 
     tasks = _tasks(result)
     intervals = {
@@ -274,15 +274,16 @@ def study_report(result: Mapping[str, Any], caveats: tuple[str, ...]) -> Any:
         for name, values, mean in _lines(result, measure)
     ]
     best = max(result["rows"], key=lambda row: row["mean"]["top_n_success"])
+    details = {"settings": result["select"], "provenance": result["provenance"]}
     return Report(
-        title=result["title"],
-        summary_sentence=(
-            f"Best over tasks: {best['name']}. {best['mean']['top_n_success']:.0%} of the highest-scoring frames are "
-            f"right, {best['mean']['times_random']:.1f} times as many as at random."
+        result["title"],
+        f"Best over tasks: {best['name']}. {best['mean']['top_n_success']:.0%} of the highest-scoring frames are "
+        f"right, {best['mean']['times_random']:.1f} times as many as at random.",
+        (
+            Caveats(caveats),
+            RewardQuality((QualityTable((*tasks, "mean"), tuple(rows)),)),
+            Details(tuple(details.items())),
         ),
-        quality=QualityTable((*tasks, "mean"), tuple(rows)),
-        caveats=caveats,
-        details={"settings": result["select"], "provenance": result["provenance"]},
     )
 
 

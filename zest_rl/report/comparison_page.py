@@ -5,121 +5,27 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.agents.foreign import FOREIGN
-from zest_rl.data import reader
+from zest_rl.data.provenance import DatasetRecord
+from zest_rl.data.reader import dataset_path, exists, open_dataset
 from zest_rl.errors import BadInput
-from zest_rl.evaluation.evaluate import Evaluation, EvaluationConfig, check_finished, evaluation_folder, read_evaluation
+from zest_rl.evaluation.evaluate import Evaluation, evaluation_folder, read_evaluation
 from zest_rl.kitchen.videos import Film, ensure_video
 from zest_rl.metrics import statistics
-from zest_rl.report import Curve, MethodRow, Report, Section
-from zest_rl.report.content import Kind
-from zest_rl.report.panels import episode_panels, goal_panel, goal_scatter, paired_panels
+from zest_rl.report.content import Curve, MethodRow, TaskTable
+from zest_rl.report.episodes import episode_panels, paired_panels
+from zest_rl.report.goals import goal_panel, goal_scatter
+from zest_rl.report.methods import Method, goal_name, latest_evaluation, methods_of_runs, read_meta
+from zest_rl.report.sections import Caveats, Details, Episodes, Goals, LearningCurves, Ranking, Report, Results, Tasks
 from zest_rl.rewards.relabel import SCORER_FILE
 from zest_rl.rewards.state_scorer import StateScorer
-from zest_rl.runtime import artifacts
 from zest_rl.training.checkpoints import snapshots
-
-
-@dataclass(frozen=True)
-class Method:
-    """One row of the comparison: the same training with different seeds."""
-
-    name: str
-    runs: tuple[Path, ...]
-    """Evaluated run folders, one per training seed."""
-    kind: Kind = "method"
-    note: str = ""
-    paper: float | None = None
-    """The paper's figure, in percent of the expert."""
-    evaluation: EvaluationConfig | None = None
-    """Which evaluation of each run; None takes the newest."""
-
-    def evaluations(self) -> list[Evaluation]:
-        """Read the evaluations, one per run.
-
-        Raises:
-            BadInput: a run was not evaluated.
-        """
-        if self.evaluation is None:
-            return [latest_evaluation(run) for run in self.runs]
-        return [read_evaluation(evaluation_folder(run, self.evaluation)) for run in self.runs]
-
-
-def methods_of_runs(runs: Sequence[Path]) -> tuple[Method, ...]:
-    """Make one method of the runs that differ in their training seed alone.
-
-    A method is called after its agent and goal, or as `zest adopt` was told; where that does not tell two apart, also
-    by the settings that do.
-
-    Raises:
-        BadInput: a folder is no finished run, or two runs are the same training with the same seed.
-    """
-    groups: dict[str, dict[int, Path]] = {}
-    settings: dict[str, dict[str, Any]] = {}
-    for run in runs:
-        meta = read_meta(run)
-        dataset = f"{meta['dataset']['id']} ({meta['data_sha256'][:8]})"
-        own = {"name": _short_name(meta), **meta["config"], "n_updates": meta["n_updates"], "dataset": dataset}
-        key = artifacts.hash_json(own)
-        settings[key] = own
-        earlier = groups.setdefault(key, {}).setdefault(meta["seed"], run)
-        if earlier != run:
-            raise BadInput(
-                f"{earlier} and {run} are the same training with the same seed; give one of them"
-                + (", or tell them apart by --name or --seed of `zest adopt`" if meta["agent"] == FOREIGN else "")
-            )
-    methods = []
-    for group, seeds in groups.items():
-        own = settings[group]
-        others = [other for other in settings.values() if other["name"] == own["name"]]
-        telling = [key for key in own if any(other.get(key) != own[key] for other in others)]
-        name = ", ".join([own["name"], *(f"{key} {own[key]}" for key in telling)])
-        methods.append(Method(name, tuple(seeds.values())))
-    return tuple(methods)
-
-
-def read_meta(run: Path) -> dict[str, Any]:
-    """Read the ``meta.json`` of a finished run.
-
-    Raises:
-        BadInput: the folder is no finished run.
-    """
-    check_finished(run)
-    meta: dict[str, Any] = artifacts.read_json(run / "meta.json")
-    return meta
-
-
-def goal_name(meta: dict[str, Any]) -> str | None:
-    """Short name of the goal whose scores a run was trained on; None for ground-truth rewards."""
-    relabel = meta["dataset"]["zest"].get("relabel")
-    return None if relabel is None else Path(relabel["scorer"]["config"]["goal"]).name
-
-
-def _short_name(meta: dict[str, Any]) -> str:
-    if meta["agent"] == FOREIGN:
-        return str(meta["name"])
-    agent = str(meta["agent"]).upper()
-    return agent if agent == "BC" else f"{agent} on {goal_name(meta) or 'ground truth'}"
-
-
-def latest_evaluation(run: Path) -> Evaluation:
-    """Read the newest evaluation of a run.
-
-    Raises:
-        BadInput: the folder is no run, or it was not evaluated.
-    """
-    check_finished(run)
-    results = sorted(run.glob("evaluations/*/result.json"), key=lambda path: path.stat().st_mtime)
-    if not results:
-        raise BadInput(f"{run} holds no evaluation; run `zest evaluate {run}` first")
-    return read_evaluation(results[-1].parent)
 
 
 def method_row(method: Method, *tasks: Sequence[Evaluation]) -> MethodRow:
@@ -140,7 +46,8 @@ def dataset_row(*dataset_ids: str, paper: float | None = None) -> MethodRow:
     """Summarise the datasets themselves, one per task (the paper's "Demo")."""
     groups, successes = [], []
     for dataset_id in dataset_ids:
-        facts, truth = reader.describe(dataset_id), reader.read_ground_truth(dataset_id)
+        with open_dataset(dataset_id) as ds:
+            facts, truth = ds.describe(), ds.truth()
         returns = np.array([episode.episode_return for episode in truth])
         groups.append([statistics.normalized_return(returns, facts["ref_min_score"], facts["ref_max_score"])])
         successes += [episode.success for episode in truth]
@@ -223,6 +130,32 @@ def _curve(name: str, quantity: str, steps: Sequence[float], columns: Sequence[S
     )
 
 
+def compare_runs(runs: Sequence[Path], *, title: str) -> Report:
+    """Build the report of evaluated runs of one task, with the goals and the source that their datasets name.
+
+    Args:
+        runs: folders; those that differ in their seed alone become one row.
+        title: headline.
+
+    Raises:
+        BadInput: no run is given, or as in `methods_of_runs` and `compare`.
+    """
+    if not runs:
+        raise BadInput("`zest report` needs at least 1 run folder; `zest train` and `zest evaluate` make them")
+    methods = methods_of_runs(tuple(dict.fromkeys(runs)))
+    goals: dict[str, str] = {}
+    sources: set[str] = set()
+    for run in runs:
+        dataset = DatasetRecord.from_description(read_meta(run)["dataset"])
+        sources.add(dataset.id if dataset.relabel is None else dataset.relabel.source)
+        if dataset.relabel is not None and exists(dataset.id):
+            goal = goal_name(dataset.relabel)
+            if goals.setdefault(goal, dataset.id) != dataset.id:
+                goals[f"{goal} ({dataset.id})"] = dataset.id
+    source = sources.pop() if len(sources) == 1 else None
+    return compare(title, methods, source_id=source if source is not None and exists(source) else None, goals=goals)
+
+
 def compare(
     title: str,
     methods: Sequence[Method],
@@ -257,10 +190,15 @@ def compare(
     rows = [method_row(method, evaluations[method.name]) for method in methods]
     if source_id is not None:
         rows.insert(0, dataset_row(source_id, paper=paper_demo))
-    scatters = {name: goal_scatter(name, dataset_id) for name, dataset_id in goals.items()}
+    scatters, goal_panels = [], []
+    for name, dataset_id in goals.items():
+        with open_dataset(dataset_id) as ds:
+            scatters.append(goal_scatter(name, ds))
+            if ds.record.relabel is not None:
+                goal_panels.append(goal_panel(name, ds.record.relabel, ds.path, scatters[-1]))
     scorer = None
     if goals:
-        scorer = StateScorer.load(reader.dataset_path(next(iter(goals.values()))) / SCORER_FILE)
+        scorer = StateScorer.load(dataset_path(next(iter(goals.values()))) / SCORER_FILE)
     shown = [method for method in methods if method.kind == "method"]
     panels = [p for m in shown for p in episode_panels(m.name, evaluations[m.name][0], scorer, film)]
     if scorer is not None:
@@ -270,21 +208,19 @@ def compare(
         first = {name: (name, of_seeds[0]) for name, of_seeds in evaluations.items()}
         others = [method.name for method in shown if _agent(metas, method) != "bc"]
         panels += [p for name in others for p in paired_panels(first[cloned], first[name], film)]
+    curves = (draw(method) for draw in (return_curve, learning_curve) for method in methods)
     return Report(
-        title=title,
-        summary_sentence=_best_sentence(rows),
-        table=tuple(rows),
-        goals=tuple(goal_panel(name, dataset_id, scatters[name]) for name, dataset_id in goals.items()),
-        episodes=tuple(panels),
-        scatters=tuple(scatters.values()),
-        curves=tuple(
-            curve
-            for draw in (return_curve, learning_curve)
-            for method in methods
-            if (curve := draw(method)) is not None
+        title,
+        _best_sentence(rows),
+        (
+            Results(tuple(rows)),
+            Caveats((*caveats, *_unequal_starts(evaluations))),
+            Goals(tuple(goal_panels)),
+            Ranking(tuple(scatters)),
+            Episodes(tuple(panels)),
+            LearningCurves(tuple(curve for curve in curves if curve is not None)),
+            Details((*(details or {}).items(), *((f"run {Path(run).name}", meta) for run, meta in metas.items()))),
         ),
-        details={**(details or {}), **{f"run {Path(run).name}": meta for run, meta in metas.items()}},
-        caveats=(*caveats, *_unequal_starts(evaluations)),
     )
 
 
@@ -314,23 +250,19 @@ def overview(
     by_name = {name: [m for of_task in methods.values() for m in of_task if m.name == name] for name in _names(methods)}
     rows = [method_row(group[0], *(method.evaluations() for method in group)) for group in by_name.values()]
     rows.insert(0, dataset_row(*sources, paper=paper_demo))
+    scatters = [(task, scatter) for task, report in reports.items() for scatter in report.items(Ranking)]
+    curves = [(task, curve) for task, report in reports.items() for curve in report.items(LearningCurves)]
     return Report(
-        title=title,
-        summary_sentence=_best_sentence(rows, f" over {len(reports)} datasets"),
-        table=tuple(rows),
-        sections=tuple(Section(task, report.table, pages[task]) for task, report in reports.items()),
-        scatters=tuple(
-            replace(scatter, name=f"{task}: {scatter.name}")
-            for task, report in reports.items()
-            for scatter in report.scatters
+        title,
+        _best_sentence(rows, f" over {len(reports)} datasets"),
+        (
+            Results(tuple(rows)),
+            Tasks(tuple(TaskTable(task, report.items(Results), pages[task]) for task, report in reports.items())),
+            Caveats(tuple(caveats)),
+            Ranking(tuple(replace(scatter, name=f"{task}: {scatter.name}") for task, scatter in scatters)),
+            LearningCurves(tuple(replace(curve, quantity=f"{task}: {curve.quantity}") for task, curve in curves)),
+            Details(tuple((details or {}).items())),
         ),
-        curves=tuple(
-            replace(curve, quantity=f"{task}: {curve.quantity}")
-            for task, report in reports.items()
-            for curve in report.curves
-        ),
-        details=details or {},
-        caveats=tuple(caveats),
     )
 
 

@@ -18,17 +18,11 @@ from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import EvaluationConfig, evaluate
 from zest_rl.kitchen.videos import Video
 from zest_rl.metrics import statistics
-from zest_rl.report.comparison import (
-    Method,
-    compare,
-    dataset_row,
-    latest_evaluation,
-    learning_curve,
-    method_row,
-    methods_of_runs,
-    return_curve,
-)
-from zest_rl.report.panels import goal_panel, goal_scatter, paired_panels
+from zest_rl.report import Caveats, Details, Episodes, Goals, LearningCurves, Results
+from zest_rl.report.comparison_page import compare, dataset_row, learning_curve, method_row, return_curve
+from zest_rl.report.episodes import paired_panels
+from zest_rl.report.goals import goal_panel, goal_scatter
+from zest_rl.report.methods import Method, latest_evaluation, methods_of_runs
 
 CONFIG = EvaluationConfig(n_episodes=2, seed=11, rtg="constant")
 
@@ -59,16 +53,16 @@ def scored_dataset(runs: Path) -> str:
 def test_a_report_compares_methods_with_the_dataset_and_shows_goal_episodes_and_losses(evaluated: Path) -> None:
     methods = methods_of_runs([evaluated / name for name in ("bc-0", "bc-1", "dt-0")])
     report = compare("T", methods, source_id=COLLECTED, goals={"scene": scored_dataset(evaluated)}, caveats=["small"])
-    assert [(row.method, row.kind, row.n_seeds, row.n_episodes) for row in report.table] == [
+    assert [(row.method, row.kind, row.n_seeds, row.n_episodes) for row in report.items(Results)] == [
         ("Demo", "dataset", 1, 4),
         ("BC", "method", 2, 4),
         ("DT on same-scene", "method", 1, 2),
     ]
-    single, paired = report.episodes[:6], report.episodes[6:]
+    single, paired = report.items(Episodes)[:6], report.items(Episodes)[6:]
     assert [panel.title for panel in single] == [
         f"{method}: {which}" for method in ("BC", "DT on same-scene") for which in ("best", "median", "worst")
     ]
-    assert all(panel.video.stat().st_size > 0 for panel in report.episodes)
+    assert all(panel.video.stat().st_size > 0 for panel in report.items(Episodes))
     assert all(panel.scores is not None and len(panel.scores) == len(panel.gt_progress) for panel in single)
     clone, other = (latest_evaluation(evaluated / name) for name in ("bc-0", "dt-0"))
     gains = other.normalized() - clone.normalized()
@@ -79,14 +73,15 @@ def test_a_report_compares_methods_with_the_dataset_and_shows_goal_episodes_and_
         np.testing.assert_array_equal(panel.gt_progress, other.traces["gt_reward"][index])
         assert panel.beside is not None
         np.testing.assert_array_equal(panel.beside[1], clone.traces["gt_reward"][index])
-    assert [goal.name for goal in report.goals] == ["scene"]
-    assert [curve.method for curve in report.curves] == ["BC", "DT on same-scene"]
-    assert report.curves[0].low is not None, "two seeds have a range"
-    assert report.curves[1].low is None
-    assert report.caveats == ("small",)
-    best = max(report.table[1:], key=lambda row: row.mean)
-    assert report.summary_sentence.startswith(f"{best.method} reaches {best.mean:.1f} % of the expert's return")
-    assert {"run bc-0", "run bc-1", "run dt-0"} <= report.details.keys()
+    assert [goal.name for goal in report.items(Goals)] == ["scene"]
+    curves = report.items(LearningCurves)
+    assert [curve.name for curve in curves] == ["BC", "DT on same-scene"]
+    assert curves[0].low is not None, "two seeds have a range"
+    assert curves[1].low is None
+    assert report.items(Caveats) == ("small",)
+    best = max(report.items(Results)[1:], key=lambda row: row.mean)
+    assert report.summary.startswith(f"{best.method} reaches {best.mean:.1f} % of the expert's return")
+    assert {"run bc-0", "run bc-1", "run dt-0"} <= dict(report.items(Details)).keys()
 
 
 def test_a_row_sums_up_the_episodes_of_all_its_seeds(evaluated: Path) -> None:
@@ -108,15 +103,15 @@ def test_the_dataset_s_own_row_is_its_normalized_ground_truth(trained: Path) -> 
 
 
 def test_a_goal_is_judged_by_how_its_returns_rank_the_episodes(trained: Path) -> None:
-    dataset = scored_dataset(trained)
-    scatter = goal_scatter("scene", dataset)
-    np.testing.assert_allclose(
-        scatter.zest_returns, [e.rewards.sum() for e in reader.read_episodes(dataset)], rtol=1e-5
-    )
-    truth = [episode.episode_return for episode in reader.read_ground_truth(dataset)]
-    np.testing.assert_allclose(scatter.gt_returns, truth, rtol=1e-5)
-    assert scatter.spearman == pytest.approx(statistics.spearman(scatter.zest_returns, scatter.gt_returns).value)
-    panel = goal_panel("scene", dataset, scatter)
+    with reader.open_dataset(scored_dataset(trained)) as ds:
+        scatter = goal_scatter("scene", ds)
+        returns = [rewards.sum() for rewards in ds.rewards()]
+        truth = [episode.episode_return for episode in ds.truth()]
+        assert ds.record.relabel is not None
+        panel = goal_panel("scene", ds.record.relabel, ds.path, scatter)
+    np.testing.assert_allclose(scatter.y, returns, rtol=1e-5)
+    np.testing.assert_allclose(scatter.x, truth, rtol=1e-5)
+    assert scatter.spearman == pytest.approx(statistics.spearman(scatter.y, scatter.x).value)
     assert (len(panel.start), len(panel.goal), panel.n_episodes) == (1, 1, 4)
     assert not np.array_equal(panel.start[0], panel.goal[0])
 
@@ -165,16 +160,14 @@ def test_a_return_curve_holds_the_snapshots_that_were_evaluated_in_every_run(tra
         np.testing.assert_allclose(curve.low, [min(means) - fall, min(means)], rtol=1e-5, atol=1e-4)
     snapshot = runs[0] / "snapshots" / "update-000000001"
     report = compare("one policy on the way", methods_of_runs([snapshot]), source_id=None, goals={})
-    assert [row.n_episodes for row in report.table] == [2]
-    assert report.curves == (), "a snapshot has no log of its own"
+    assert [row.n_episodes for row in report.items(Results)] == [2]
+    assert report.items(LearningCurves) == (), "a snapshot has no log of its own"
 
 
-def test_too_few_episodes_to_rank_are_no_failure(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    dataset = scored_dataset(trained)
-    episodes, truth = reader.read_episodes(dataset)[:2], reader.read_ground_truth(dataset)[:2]
-    monkeypatch.setattr(reader, "read_episodes", lambda _: episodes)
-    monkeypatch.setattr(reader, "read_ground_truth", lambda _: truth)
-    assert np.isnan(goal_scatter("scene", dataset).spearman)
+def test_too_few_episodes_to_rank_are_no_failure(trained: Path) -> None:
+    with reader.open_dataset(scored_dataset(trained)) as ds:
+        two = replace(ds, groups={name: ds.groups[name] for name in list(ds.groups)[:2]})
+        assert np.isnan(goal_scatter("scene", two).spearman)
 
 
 def test_a_learning_curve_is_the_mean_of_the_logged_losses_with_their_range(trained: Path) -> None:
@@ -226,7 +219,7 @@ def test_the_newest_evaluation_is_shown_unless_one_is_asked_for(evaluated: Path)
     evaluate(evaluated / "bc-0", newer, n_workers=1)
     assert latest_evaluation(evaluated / "bc-0").config == newer
     methods = [Method("BC", (evaluated / "bc-0",), "control", evaluation=which) for which in (None, CONFIG, newer)]
-    rows = [compare("T", [method], source_id=None, goals={}).table[0] for method in methods]
+    rows = [compare("T", [method], source_id=None, goals={}).items(Results)[0] for method in methods]
     assert [row.n_episodes for row in rows] == [3, 2, 3]
 
 
@@ -234,7 +227,7 @@ def test_a_report_says_when_methods_did_not_meet_the_same_starts(evaluated: Path
     evaluate(evaluated / "bc-0", replace(CONFIG, n_episodes=3), n_workers=1)
     methods = [Method("BC", (evaluated / "bc-0",), "control"), Method("DT", (evaluated / "dt-0",), "control")]
     report = compare("T", methods, source_id=None, goals={}, caveats=["small"])
-    assert report.caveats == (
+    assert report.items(Caveats) == (
         "small",
         "The methods were not evaluated on the same starts, so their numbers are not paired "
         "(BC: 3 from seed 11; DT: 2 from seed 11).",

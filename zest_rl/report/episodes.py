@@ -1,53 +1,20 @@
-"""Evaluations and relabeled datasets → what a report shows of them: goals, rankings, episodes with their videos."""
+"""Evaluations → the episodes that a report shows, with their videos."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.data import reader
-from zest_rl.data.images import list_images, read_image
 from zest_rl.evaluation.evaluate import Evaluation, evaluation_folder
-from zest_rl.kitchen.tasks import get_task
 from zest_rl.kitchen.videos import FPS, Film, Video
 from zest_rl.metrics import statistics
-from zest_rl.report import EpisodePanel, GoalPanel, Scatter
-from zest_rl.rewards.goals import read_goal, read_text
-from zest_rl.rewards.relabel import GOAL_FOLDER
+from zest_rl.report.content import EpisodePanel
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 from zest_rl.types import FloatArray
-
-MIN_EPISODES_TO_RANK = 3
-
-
-def goal_scatter(name: str, dataset_id: str) -> Scatter:
-    """Return by a relabeled dataset's rewards against its ground-truth return, per episode."""
-    zest = np.array([episode.rewards.sum(dtype=np.float64) for episode in reader.read_episodes(dataset_id)])
-    truth = np.array([episode.episode_return for episode in reader.read_ground_truth(dataset_id)])
-    rho = statistics.Estimate(math.nan, math.nan, math.nan)
-    if len(zest) >= MIN_EPISODES_TO_RANK:
-        rho = statistics.spearman(zest, truth)
-    return Scatter(name, zest.astype(np.float32), truth.astype(np.float32), rho.value, (rho.low, rho.high))
-
-
-def goal_panel(name: str, dataset_id: str, scatter: Scatter | None = None) -> GoalPanel:
-    """The goal of a relabeled dataset, as pictures or sentences; how it ranks episodes, where that is known."""
-    made = reader.read_metadata(dataset_id)["zest"]["relabel"]
-    config = made["scorer"]["config"]
-    ranking = (None, 0) if scatter is None else (scatter.spearman, len(scatter.gt_returns))
-    folder = reader.dataset_path(dataset_id) / GOAL_FOLDER
-    if folder.is_dir():
-        start, goal = (tuple(read_image(path) for path in list_images(folder / part)) for part in ("init", "goal"))
-        return GoalPanel(name, start, goal, *ranking)
-    foreign = "views" not in config
-    sentences = read_text(config["goal"]) if foreign else read_goal(config["goal"], get_task(config["views"]["task"]))
-    kept = range(len(sentences.goals)) if made["kept_goals"] is None else made["kept_goals"]
-    return GoalPanel(name, sentences.starts, tuple(sentences.goals[k] for k in kept), *ranking)
 
 
 def episode_panels(name: str, evaluation: Evaluation, scorer: StateScorer | None, film: Film) -> list[EpisodePanel]:

@@ -1,0 +1,191 @@
+"""The figures that judge the rewards of a dataset, and the sentences that warn of them. Ground truth judges alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.metrics import reward_quality, statistics
+from zest_rl.metrics.statistics import Estimate
+from zest_rl.types import FloatArray, GroundTruth
+
+CLOCK, STRAIGHT, SATURATED, STILL, CONTRADICTORY = 0.95, 0.9, 0.95, 0.9, 0.01
+"""From these shares on a warning is given."""
+FLAT = 1e-5
+"""Scores whose range is at most this share of the largest are constant, whatever rounding makes of them."""
+
+
+@dataclass(frozen=True)
+class Rewards:
+    """What is known of the rewards of one dataset."""
+
+    rewards: list[FloatArray]
+    """(T,) per episode, as a trainer sees them."""
+    scores: list[FloatArray]
+    """(T,) per episode, of the frames after each action; the rewards, unless these are differences."""
+    states: list[NDArray[np.float64]] | None
+    """(T+1, nq) per episode, rounded as the frames were rendered; None of other robots than the kitchen's."""
+    still: list[NDArray[np.bool_]] | None
+    """(T,) per episode, frames that show what the first one shows; None where that is not known."""
+    truth: list[GroundTruth] | None
+
+    @cached_property
+    def returns(self) -> NDArray[np.float64]:
+        """(N,) float64."""
+        return reward_quality.returns_of(self.rewards)
+
+
+Truth = list[GroundTruth]
+Measure = Callable[[Rewards], Estimate | None]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One number that judges a reward."""
+
+    key: str
+    label: str
+    """What people and `zest inspect --json` call it."""
+    meaning: str
+    measure: Measure
+    """None where what it needs is not known."""
+
+
+def true_returns(truth: Truth) -> NDArray[np.float64]:
+    """(N,) float64."""
+    return np.array([episode.episode_return for episode in truth])
+
+
+def _with_truth(measure: Callable[[Rewards, Truth], Estimate]) -> Measure:
+    return lambda known: None if known.truth is None else measure(known, known.truth)
+
+
+FIGURES = (
+    Figure(
+        "spearman",
+        "Spearman ρ",
+        "rank correlation of the episodes' returns with the true ones; 1 is best",
+        _with_truth(lambda known, truth: statistics.spearman(known.returns, true_returns(truth))),
+    ),
+    Figure(
+        "kendall",
+        "Kendall τ-b",
+        "the same by pairs; 1 is best",
+        _with_truth(lambda known, truth: reward_quality.kendall(known.returns, true_returns(truth))),
+    ),
+    Figure(
+        "pairwise_accuracy",
+        "Pairwise accuracy",
+        "share of pairs of episodes that are ordered rightly; .5 is chance",
+        _with_truth(lambda known, truth: reward_quality.pairwise_accuracy(known.returns, true_returns(truth))),
+    ),
+    Figure(
+        "auprc",
+        "AUPRC of success",
+        "how well the return tells successes; chance is their share, which is the next line",
+        _with_truth(
+            lambda known, truth: reward_quality.average_precision(known.returns, np.array([e.success for e in truth]))
+        ),
+    ),
+    Figure(
+        "successes",
+        "Share of successes",
+        "in the dataset",
+        _with_truth(lambda known, truth: statistics.wilson(sum(e.success for e in truth), len(truth))),
+    ),
+    Figure(
+        "epic",
+        "EPIC distance",
+        "of levels to the true reward, step by step; 0 is the same up to scale and offset, .71 unrelated",
+        _with_truth(lambda known, truth: reward_quality.epic_distance(known.scores, [e.rewards for e in truth])),
+    ),
+    Figure(
+        "value_order",
+        "Value-order correlation",
+        "of reward and time within an episode; 1 rises at every step",
+        lambda known: reward_quality.value_order(known.rewards),
+    ),
+    Figure(
+        "told_by_step",
+        "Told by the step",
+        "share of the rewards' variance that the number of the step tells; 1 is a clock",
+        lambda known: reward_quality.share_told_by_step(known.rewards),
+    ),
+    Figure(
+        "straight_in_time",
+        "Straight in time",
+        "share of the score's variance within an episode that a straight line in time tells; 1 is proportional to time",
+        lambda known: reward_quality.straight_in_time(known.scores),
+    ),
+    Figure(
+        "saturated",
+        "Saturated",
+        "share of rewards next to the lowest or the highest",
+        lambda known: reward_quality.share_saturated(known.rewards),
+    ),
+    Figure(
+        "still",
+        "Nothing to see",
+        "share of frames that show what the first one shows",
+        lambda known: None if known.still is None else reward_quality.share_still(known.still),
+    ),
+    Figure(
+        "contradictory",
+        "Contradictory",
+        "share of frames that score otherwise than an equal one of the same episode; 0 is right",
+        lambda known: (
+            None
+            if known.states is None
+            else reward_quality.share_contradictory(known.scores, [episode[1:] for episode in known.states])
+        ),
+    ),
+)
+
+
+def measure(known: Rewards) -> dict[str, Estimate]:
+    """Return the figures by their keys; those that need what is not known are missing."""
+    measured = {figure.key: figure.measure(known) for figure in FIGURES}
+    return {key: estimate for key, estimate in measured.items() if estimate is not None}
+
+
+def warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimate]) -> list[str]:
+    """What speaks against training on these rewards: sentences, none when nothing does.
+
+    Args:
+        rewards: (T,) per episode.
+        figures: by the keys of `FIGURES`; those that were not measured are missing.
+    """
+    every = np.concatenate(rewards)
+    if np.ptp(every) <= FLAT * np.abs(every).max():
+        return ["All frames score the same: this goal and embedder tell nothing apart. Look at the goal's pictures."]
+    found = []
+    if np.ptp(reward_quality.returns_of(rewards)) == 0:
+        found.append("All episodes have the same return: there is nothing to condition a Decision Transformer on.")
+    if "contradictory" in figures and figures["contradictory"].value >= CONTRADICTORY:
+        found.append(
+            f"{figures['contradictory'].value:.0%} of the frames score otherwise than an equal frame of the same "
+            "episode: these scores are not of these episodes (shuffled?)."
+        )
+    if figures["told_by_step"].value >= CLOCK:
+        found.append("The number of the step alone tells the score: the reward is a clock, whatever the robot does.")
+    elif figures["straight_in_time"].value >= STRAIGHT:
+        found.append(
+            "In every episode, good or bad, the score is nearly proportional to time: it may tell how long the robot "
+            "has moved rather than how near the goal is."
+        )
+    if figures["saturated"].value >= SATURATED:
+        found.append("Nearly all frames score next to the lowest or the highest: most progress is not rewarded.")
+    if "still" in figures and figures["still"].value >= STILL:
+        found.append("Most frames show what the first one shows: nothing moves, or the cameras do not see it.")
+    rho = figures.get("spearman")
+    if rho is not None and not rho.low > 0:  # also when it is NaN
+        against = " The higher the return, the worse the episode." if rho.high < 0 else ""
+        found.append(
+            f"The returns do not rank the episodes as the true ones do: ρ = {rho.value:.2f}, "
+            f"95 % interval {rho.low:.2f} to {rho.high:.2f}.{against}"
+        )
+    return found

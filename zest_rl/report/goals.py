@@ -1,0 +1,48 @@
+"""A relabeled dataset → what a report shows of its goal: pictures or sentences, and how it ranks episodes."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from zest_rl.data.images import list_images, read_image
+from zest_rl.data.provenance import RelabelRecord
+from zest_rl.data.reader import Dataset
+from zest_rl.kitchen.tasks import get_task
+from zest_rl.metrics import statistics
+from zest_rl.report.content import GoalPanel, Scatter
+from zest_rl.rewards.goals import read_goal, read_text
+from zest_rl.rewards.relabel import GOAL_FOLDER
+
+
+def goal_scatter(name: str, ds: Dataset) -> Scatter:
+    """Return by a relabeled dataset's rewards against its ground-truth return, per episode."""
+    returns = np.array([rewards.sum(dtype=np.float64) for rewards in ds.rewards()])
+    truth = np.array([episode.episode_return for episode in ds.truth()])
+    rho = statistics.Estimate(math.nan, math.nan, math.nan)
+    if len(returns) >= statistics.MIN_EPISODES_TO_RANK:
+        rho = statistics.spearman(returns, truth)
+    return Scatter(name, truth.astype(np.float32), returns.astype(np.float32), rho.value, (rho.low, rho.high))
+
+
+def goal_panel(name: str, made: RelabelRecord, folder: Path, scatter: Scatter | None = None) -> GoalPanel:
+    """The goal of a relabeled dataset, as pictures or sentences.
+
+    Args:
+        name: what the report calls the goal.
+        made: how the dataset was relabeled.
+        folder: of the dataset.
+        scatter: how the goal ranks episodes, where that is known.
+    """
+    ranking = (None, 0) if scatter is None else (scatter.spearman, len(scatter.x))
+    if (folder / GOAL_FOLDER).is_dir():
+        start, goal = (
+            tuple(read_image(path) for path in list_images(folder / GOAL_FOLDER / part)) for part in ("init", "goal")
+        )
+        return GoalPanel(name, start, goal, *ranking)
+    views = made.scorer.views
+    sentences = read_text(made.scorer.goal) if views is None else read_goal(made.scorer.goal, get_task(views["task"]))
+    kept = range(len(sentences.goals)) if made.kept_goals is None else made.kept_goals
+    return GoalPanel(name, sentences.starts, tuple(sentences.goals[k] for k in kept), *ranking)

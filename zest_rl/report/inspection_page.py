@@ -1,0 +1,120 @@
+"""Inspected datasets → one page: all figures side by side, the episodes behind them, and which task each goal is of."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from zest_rl.analysis.cross_task import JointInspection
+from zest_rl.analysis.episode_view import EpisodeView
+from zest_rl.analysis.inspection import Inspection, labels
+from zest_rl.analysis.reward_figures import FIGURES
+from zest_rl.data.reader import dataset_path
+from zest_rl.metrics.statistics import MIN_EPISODES_TO_RANK, spearman
+from zest_rl.report.content import Curve, Matrix, QualityRow, QualityTable, Scatter, Strip
+from zest_rl.report.goals import goal_panel
+from zest_rl.report.sections import (
+    Details,
+    Frames,
+    Goals,
+    Pixels,
+    Ranking,
+    Report,
+    RewardQuality,
+    ScoresOverTime,
+    TasksAgainstGoals,
+    Views,
+    Warnings,
+)
+
+
+def inspection_report(joint: JointInspection) -> Report:
+    """Build the page; frames are rendered and scored for it."""
+    names = tuple(labels(joint.inspections))
+    inspections = dict(zip(names, joint.inspections, strict=True))
+    scatters = {name: _scatter(name, each) for name, each in inspections.items()}
+    views = {
+        name: joint.views[each.dataset_id] for name, each in inspections.items() if joint.views.get(each.dataset_id)
+    }
+    compared = joint.confusion
+    n_warnings = sum(map(len, joint.warnings.values()))
+    return Report(
+        "What these rewards are worth",
+        f"Datasets: {len(names)}, warnings: {n_warnings}. Nothing was trained.",
+        (
+            Warnings(tuple(f"{dataset}: {text}" for dataset, texts in joint.warnings.items() for text in texts)),
+            RewardQuality((_quality(inspections),)),
+            TasksAgainstGoals(
+                ()
+                if compared is None
+                else (Matrix(compared.row_names(), names, compared.means, compared.low, compared.high),)
+            ),
+            Goals(
+                tuple(
+                    goal_panel(name, each.made, dataset_path(each.dataset_id), scatters[name])
+                    for name, each in inspections.items()
+                )
+            ),
+            Ranking(tuple(scatter for scatter in scatters.values() if scatter is not None)),
+            Frames(tuple(strip for name in views for strip in _strips(name, inspections[name], views[name]))),
+            Views(tuple(curve for name in views for curve in _by_view(name, views[name]["best"]))),
+            Pixels(tuple(_pixels(name, views[name]["best"]) for name in views)),
+            ScoresOverTime(tuple(curve for name, each in inspections.items() for curve in _over_time(name, each))),
+            Details(
+                tuple((name, {"dataset": each.dataset_id, **each.made.to_json()}) for name, each in inspections.items())
+            ),
+        ),
+    )
+
+
+def _quality(inspections: Mapping[str, Inspection]) -> QualityTable:
+    measured = [inspection.known_figures() for inspection in inspections.values()]
+    rows = []
+    for figure in FIGURES:
+        estimates = [figures.get(figure.key) for figures in measured]
+        values = tuple(None if each is None else (each.value, each.low, each.high) for each in estimates)
+        rows.append(QualityRow(figure.label, figure.meaning, values))
+    return QualityTable(tuple(inspections), tuple(rows))
+
+
+def _scatter(name: str, inspection: Inspection) -> Scatter | None:
+    """The returns that were inspected, against the true ones."""
+    if inspection.true_returns is None:
+        return None
+    rho = inspection.figures["spearman"]
+    truth, returns = (array.astype(np.float32) for array in (inspection.true_returns, inspection.returns))
+    return Scatter(name, truth, returns, rho.value, (rho.low, rho.high))
+
+
+def _strips(name: str, inspection: Inspection, views: Mapping[str, EpisodeView]) -> list[Strip]:
+    low, high = inspection.score_range
+    size = high - low or 1.0
+    return [
+        Strip(
+            f"{name}: {which}", tuple(view.frames), tuple(map(int, view.steps)), (view.scores[view.steps] - low) / size
+        )
+        for which, view in views.items()
+    ]
+
+
+def _by_view(name: str, view: EpisodeView) -> list[Curve]:
+    steps = np.arange(len(view.scores), dtype=np.float32)
+    curves = {"all views": view.scores, **{f"view {i}": scores for i, scores in enumerate(view.by_view, 1)}}
+    return [Curve(label, f"{name}: score", steps, scores) for label, scores in curves.items()]
+
+
+def _pixels(name: str, view: EpisodeView) -> Scatter:
+    changed, scores = view.pixel_difference[1:], view.scores[1:]
+    rho = math.nan
+    if len(scores) >= MIN_EPISODES_TO_RANK:  # the interval of steps that follow each other would be far too narrow
+        rho = spearman(changed.astype(np.float64), scores.astype(np.float64), n_resamples=1).value
+    return Scatter(name, changed, scores, rho, x_name="mean pixel difference", y_name="ZeST score", point="step")
+
+
+def _over_time(name: str, inspection: Inspection) -> list[Curve]:
+    return [
+        Curve(group, f"{name}: mean reward", np.arange(1, len(mean) + 1, dtype=np.float32), mean)
+        for group, mean in inspection.over_time.items()
+    ]

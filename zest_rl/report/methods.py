@@ -1,0 +1,109 @@
+"""Evaluated runs → the methods that a report compares, each with one run per training seed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from zest_rl.agents.foreign import FOREIGN
+from zest_rl.data.provenance import DatasetRecord, RelabelRecord
+from zest_rl.errors import BadInput
+from zest_rl.evaluation.evaluate import Evaluation, EvaluationConfig, check_finished, evaluation_folder, read_evaluation
+from zest_rl.report.content import Kind
+from zest_rl.runtime import artifacts
+
+
+@dataclass(frozen=True)
+class Method:
+    """One row of the comparison: the same training with different seeds."""
+
+    name: str
+    runs: tuple[Path, ...]
+    """Evaluated run folders, one per training seed."""
+    kind: Kind = "method"
+    note: str = ""
+    paper: float | None = None
+    """The paper's figure, in percent of the expert."""
+    evaluation: EvaluationConfig | None = None
+    """Which evaluation of each run; None takes the newest."""
+
+    def evaluations(self) -> list[Evaluation]:
+        """Read the evaluations, one per run.
+
+        Raises:
+            BadInput: a run was not evaluated.
+        """
+        if self.evaluation is None:
+            return [latest_evaluation(run) for run in self.runs]
+        return [read_evaluation(evaluation_folder(run, self.evaluation)) for run in self.runs]
+
+
+def methods_of_runs(runs: Sequence[Path]) -> tuple[Method, ...]:
+    """Make one method of the runs that differ in their training seed alone.
+
+    A method is called after its agent and goal, or as `zest adopt` was told; where that does not tell two apart, also
+    by the settings that do.
+
+    Raises:
+        BadInput: a folder is no finished run, or two runs are the same training with the same seed.
+    """
+    groups: dict[str, dict[int, Path]] = {}
+    settings: dict[str, dict[str, Any]] = {}
+    for run in runs:
+        meta = read_meta(run)
+        dataset = f"{meta['dataset']['id']} ({meta['data_sha256'][:8]})"
+        own = {"name": _short_name(meta), **meta["config"], "n_updates": meta["n_updates"], "dataset": dataset}
+        key = artifacts.hash_json(own)
+        settings[key] = own
+        earlier = groups.setdefault(key, {}).setdefault(meta["seed"], run)
+        if earlier != run:
+            raise BadInput(
+                f"{earlier} and {run} are the same training with the same seed; give one of them"
+                + (", or tell them apart by --name or --seed of `zest adopt`" if meta["agent"] == FOREIGN else "")
+            )
+    methods = []
+    for group, seeds in groups.items():
+        own = settings[group]
+        others = [other for other in settings.values() if other["name"] == own["name"]]
+        telling = [key for key in own if any(other.get(key) != own[key] for other in others)]
+        name = ", ".join([own["name"], *(f"{key} {own[key]}" for key in telling)])
+        methods.append(Method(name, tuple(seeds.values())))
+    return tuple(methods)
+
+
+def read_meta(run: Path) -> dict[str, Any]:
+    """Read the ``meta.json`` of a finished run.
+
+    Raises:
+        BadInput: the folder is no finished run.
+    """
+    check_finished(run)
+    meta: dict[str, Any] = artifacts.read_json(run / "meta.json")
+    return meta
+
+
+def goal_name(relabel: RelabelRecord) -> str:
+    """Short name of the goal whose scores are a dataset's rewards."""
+    return Path(relabel.scorer.goal).name
+
+
+def _short_name(meta: dict[str, Any]) -> str:
+    if meta["agent"] == FOREIGN:
+        return str(meta["name"])
+    agent, relabel = str(meta["agent"]).upper(), DatasetRecord.from_description(meta["dataset"]).relabel
+    return agent if agent == "BC" else f"{agent} on {'ground truth' if relabel is None else goal_name(relabel)}"
+
+
+def latest_evaluation(run: Path) -> Evaluation:
+    """Read the newest evaluation of a run.
+
+    Raises:
+        BadInput: the folder is no run, or it was not evaluated.
+    """
+    check_finished(run)
+    results = sorted(run.glob("evaluations/*/result.json"), key=lambda path: path.stat().st_mtime)
+    if not results:
+        raise BadInput(f"{run} holds no evaluation; run `zest evaluate {run}` first")
+    return read_evaluation(results[-1].parent)
