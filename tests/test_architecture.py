@@ -23,9 +23,9 @@ ROOMS = (
 """The pipeline: a module imports only from its own room and from those before it."""
 
 MAY_READ_GROUND_TRUTH = (
-    "data.reader", "export.transitions", "analysis.inspection", "report.comparison", "report.panels",
+    "data.reader", "export.transitions", "analysis.inspection", "report.comparison_page", "report.goals",
 )  # fmt: skip
-"""`read_ground_truth` and its only callers, which make reports or copies: nothing that chooses or trains anything."""
+"""`Dataset.truth` and its only callers, which make reports or copies: nothing that chooses or trains anything."""
 
 HEAVY = ("torch", "transformers", "mujoco", "minari", "timm", "open_clip", "gymnasium", "matplotlib", "scipy", "h5py")
 
@@ -126,11 +126,11 @@ def test_importing_the_package_or_its_command_imports_nothing_heavy(module: str)
 
 
 def test_the_ground_truth_of_a_dataset_is_read_only_where_reports_are_made() -> None:
-    readers = {module_name(path) for path in SOURCES if "read_ground_truth" in path.read_text()}
+    readers = {module_name(path) for path in SOURCES if ".truth()" in path.read_text()}
     assert readers == set(MAY_READ_GROUND_TRUTH)
     for path in SOURCES:
         if "infos/gt" in path.read_text():
-            assert room(module_name(path)) == "data", "it is read through `read_ground_truth` alone"
+            assert room(module_name(path)) == "data", "it is read through `Dataset.truth` alone"
 
 
 def test_ground_truth_read_from_states_is_for_judging_alone() -> None:
