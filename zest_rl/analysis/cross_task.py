@@ -187,6 +187,6 @@ def inspect_datasets(
         else:
             for dataset, sentence in confusion_warnings(inspections, compared).items():
                 warnings[dataset] = (*warnings[dataset], sentence)
-    if on_progress is not None:
+    if on_progress is not None and n_done < 2 * len(ids):
         on_progress(1, 1)
     return JointInspection(tuple(inspections), views, compared, warnings, tuple(left_out))
