@@ -137,7 +137,7 @@ def test_ground_truth_read_from_states_is_for_judging_alone() -> None:
     users = {module_name(path) for path in SOURCES if "progress_of" in path.read_text()}
     assert users == {"kitchen.env", "analysis.frame_selection"}
     importers = {module_name(path) for path in SOURCES if "zest_rl.analysis.frame_selection import" in path.read_text()}
-    assert importers == {"cli.select"}
+    assert importers == {"cli.select.frames"}
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=module_name)

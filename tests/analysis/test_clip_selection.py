@@ -14,18 +14,8 @@ import pytest
 from PIL import Image
 
 from zest_rl import cli
-from zest_rl.analysis.clip_selection import (
-    GOAL_SHARE,
-    LABELS,
-    OPENING,
-    VIDEOS,
-    Clip,
-    candidates,
-    embed_clips,
-    enough,
-    folder_of_clips,
-    something_something,
-)
+from zest_rl.analysis.clip_selection import GOAL_SHARE, candidates, enough
+from zest_rl.analysis.clips import LABELS, OPENING, VIDEOS, Clip, embed_clips, folder_of_clips, something_something
 from zest_rl.data.video import read_frames
 from zest_rl.embedders import load_embedder
 from zest_rl.errors import BadInput

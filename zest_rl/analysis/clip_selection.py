@@ -1,4 +1,4 @@
-"""Real video: clips as files or as folders of pictures, and folders laid out as Something-Something V2.
+"""Clips of real video → candidates of goal and action selection, scored by the first and last frame of other clips.
 
 A clip shows one object that is acted on from its start to its end: its first frame is a start, its last one a goal, and
 its last `GOAL_SHARE` of frames count as reaching the goal of the same object, and as showing the action that all clips
@@ -7,166 +7,25 @@ share. That reading is ours; Cui et al. 2022 (§5.2) do not say which frames do.
 
 from __future__ import annotations
 
-import json
-import re
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.data.video import VIDEO_SUFFIXES, read_frames
-from zest_rl.embedders import Embedder
-from zest_rl.errors import BadInput, nearest
-from zest_rl.metrics.selection import others
-from zest_rl.metrics.statistics import Values
+from zest_rl.analysis.clips import OPENING, Clip, embed_clips, find_clips
+from zest_rl.embedders import DEFAULT_EMBEDDER, Precision, load_embedder
+from zest_rl.errors import BadInput
+from zest_rl.metrics import selection
+from zest_rl.metrics.statistics import Estimate, Values, bootstrap
 from zest_rl.rewards.scores import Features, Similarity, score_views
-from zest_rl.runtime import artifacts
-from zest_rl.runtime.arrays import read_arrays, write_arrays
-from zest_rl.runtime.parallel import one_thread
 from zest_rl.types import FloatArray
 
-OPENING = "Opening [something]"
-OBJECTS = ("door", "drawer", "box", "fridge", "laptop", "washing machine", "oven")
-"""The seven objects of the paper."""
-CALLED = {
-    "box": "box(es)?",
-    "fridge": "(fridge|refrigerator)s?",
-    "laptop": "laptops?( computers?)?",
-    "oven": "(?<!microwave )ovens?",
-}
-"""What labels call an object, where it is not its name alone or with an s."""
 GOAL_SHARE = 0.2
-VIDEOS = "20bn-something-something-v2"
-LABELS = tuple(
-    f"{folder}{prefix}{part}.json"
-    for folder in ("", "labels/")
-    for prefix in ("something-something-v2-", "")
-    for part in ("train", "validation")
-)
-"""Where the labels of its releases stand."""
-
-
-@dataclass(frozen=True)
-class Clip:
-    """One video of one object."""
-
-    path: Path
-    """A video file, or a folder of pictures in the order of their names."""
-    thing: str
-    """What is acted on."""
-
-
-def find_clips(root: Path, template: str = OPENING) -> list[Clip]:
-    """Find the clips in a folder of either layout: `something_something` or `folder_of_clips`.
-
-    Args:
-        root: the folder.
-        template: the action; in a folder by object all clips are of it.
-
-    Raises:
-        BadInput: there is none.
-    """
-    return something_something(root, template=template) if (root / VIDEOS).exists() else folder_of_clips(root)
-
-
-def something_something(root: Path, things: Sequence[str] = OBJECTS, template: str = OPENING) -> list[Clip]:
-    """Find the clips of one action on some objects in a folder laid out as Something-Something V2.
-
-    The folder holds ``20bn-something-something-v2/ID.webm`` and one of `LABELS`, lists of ``{"id", "template",
-    "placeholders"}``. A clip is of what its first placeholder ends with: "a kitchen drawer" is a drawer, "the fridge
-    door" a fridge.
-
-    Raises:
-        BadInput: the layout is another one, or no clip is found.
-    """
-    files = [root / name for name in LABELS if (root / name).is_file()]
-    if not files or not (root / VIDEOS).is_dir():
-        raise BadInput(f"{root} must hold {VIDEOS}/ and {LABELS[0]} (or {LABELS[-2]}), as Something-Something V2 does")
-    clips, templates = [], set()
-    for file in files:
-        try:
-            entries = json.loads(file.read_text(encoding="utf-8"))
-            for entry in entries:
-                templates.add(entry["template"])
-                if entry["template"] == template:
-                    thing = _named(str(entry["placeholders"][0]).lower().strip(), things)
-                    path = root / VIDEOS / f"{entry['id']}.webm"
-                    if thing is not None and path.is_file():
-                        clips.append(Clip(path, thing))
-        except (ValueError, KeyError, TypeError, IndexError) as error:
-            raise BadInput(f"{file} is not a list of labels ({error!r}); download it again") from error
-    if template not in templates:
-        raise BadInput(f"no clip is of {template!r}; {nearest(template, templates)}")
-    if not clips:
-        raise BadInput(f"{root} has no video of {template!r} with {', '.join(things)}")
-    return clips
-
-
-def _named(words: str, things: Sequence[str]) -> str | None:
-    """Return which thing a label names, if any."""
-
-    def ends(text: str) -> str | None:
-        called = {thing: CALLED.get(thing, f"{re.escape(thing)}s?") for thing in things}
-        return next((thing for thing, name in called.items() if re.search(rf"\b({name})$", text)), None)
-
-    return ends(re.sub(r"\s+doors?$", "", words)) or ends(words)
-
-
-def folder_of_clips(root: Path) -> list[Clip]:
-    """Find clips that are sorted by object: ``ROOT/OBJECT/CLIP.mp4``, or ``ROOT/OBJECT/CLIP/`` with pictures.
-
-    Raises:
-        BadInput: there is none.
-    """
-    clips = [
-        Clip(path, thing.name)
-        for thing in _visible(root)
-        if thing.is_dir()
-        for path in _visible(thing)
-        if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES
-    ]
-    if not clips:
-        raise BadInput(
-            f"{root} must hold a folder per object with videos, or folders of pictures, in it, or {VIDEOS}/ and labels "
-            "as Something-Something V2 does"
-        )
-    return clips
-
-
-def _visible(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if not path.name.startswith(".")) if folder.is_dir() else []
-
-
-def embed_clips(
-    clips: Sequence[Clip], embedder: Embedder, n_frames: int, on_done: Callable[[], object] = lambda: None
-) -> list[FloatArray]:
-    """Embed clips, each once: what was embedded is kept in the cache, by content.
-
-    Args:
-        clips: what to embed.
-        embedder: the network.
-        n_frames: of each clip.
-        on_done: called after each clip.
-
-    Returns:
-        (n, D) float32 per clip.
-    """
-    vectors = []
-    for clip in clips:
-        parts = sorted(clip.path.iterdir()) if clip.path.is_dir() else [clip.path]
-        content = [artifacts.hash_file(path) for path in parts if path.is_file()]
-        digest = artifacts.hash_json([content, embedder.fingerprint, n_frames])
-        path = artifacts.cache_dir() / "clips" / f"{digest[:20]}.npz"
-        cached = read_arrays(path)
-        if cached is None:
-            with one_thread():
-                cached = {"embeddings": embedder.embed_images(read_frames(clip.path, n_frames))}
-            write_arrays(path, cached)
-        vectors.append(np.asarray(cached["embeddings"], dtype=np.float32))
-        on_done()
-    return vectors
+"""Of a clip's frames, the last ones."""
 
 
 @dataclass(frozen=True)
@@ -222,7 +81,7 @@ def candidates(
         seed: of that draw.
     """
     pool = [i for i, clip in enumerate(clips) if i != left_out and (diverse or clip.thing == thing)]
-    contexts = np.arange(len(pool)) if same_context else others(len(pool), seed)
+    contexts = np.arange(len(pool)) if same_context else selection.others(len(pool), seed)
     lengths = [len(embeddings[i]) for i in pool]
     reached = [
         (np.arange(n) >= n - max(1, round(GOAL_SHARE * n))) & (any_thing or clips[i].thing == thing)
@@ -235,3 +94,140 @@ def candidates(
         np.repeat(pool, np.array(lengths) - 1),
         np.concatenate([one[1:] for one in reached]),
     )
+
+
+@dataclass(frozen=True)
+class ObjectSelection:
+    """How well goals of one object are found; means over the clips that specified the goal in turn."""
+
+    top_n_success: Estimate
+    relative_variation: Estimate
+    goal_frame_ratio: float
+    """Share of the candidates that are right: what picking at random finds."""
+    top: int
+    """N of the Top-N success rate, where fewer candidates are right than were asked for."""
+    n_goals: int
+    n_clips: int
+    """Of this object."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the figures by their names."""
+        estimates = {name: getattr(self, name).as_json() for name in ("top_n_success", "relative_variation")}
+        return {**vars(self), **estimates}
+
+
+@dataclass(frozen=True)
+class ClipSelection:
+    """What goals and actions are found in real video."""
+
+    objects: Mapping[str, ObjectSelection]
+    left_out: tuple[str, ...]
+    """Objects that have too few clips."""
+    n_clips: int
+    embedder_sha256: str
+
+    def mean(self) -> dict[str, float]:
+        """Return the means over objects, and how many times better than random the highest scores are."""
+        found = float(np.mean([judged.top_n_success.value for judged in self.objects.values()]))
+        chance = float(np.mean([judged.goal_frame_ratio for judged in self.objects.values()]))
+        return {"top_n_success": found, "goal_frame_ratio": chance, "times_random": found / chance}
+
+
+def select_clips(
+    folder: Path,
+    *,
+    goals: Path | None = None,
+    ask: Literal["goals", "actions"] = "goals",
+    template: str = OPENING,
+    pool: Literal["single", "all"] = "single",
+    context: Literal["same", "different"] = "same",
+    embedder: str = DEFAULT_EMBEDDER,
+    features: Features = "delta",
+    similarity: Similarity = "cos",
+    top: int = selection.TOP_N,
+    n_frames: int = 24,
+    n_repeats: int = 10,
+    max_clips: int | None = None,
+    precision: Precision = "auto",
+    device: str = "auto",
+    on_progress: Callable[[int, int], None] | None = None,
+) -> ClipSelection:
+    """Let clip after clip specify the goal by its first and last frame: do the highest scores find the end of a clip?
+
+    Args:
+        folder: clips, as for `find_clips`.
+        goals: folder of other clips, which specify the goals; default those of `folder` in turn.
+        ask: goals: is the clip of the goal's object? actions: of any, as all do the same; takes the pool of all.
+        template: with Something-Something V2: the action.
+        pool: candidates of the goal's object alone, or of all objects.
+        context: x_0 of a candidate: of its own clip, or of another one.
+        embedder: URI of the network.
+        features: how frames and goals are compared.
+        similarity: how frames and goals are compared.
+        top: N of the Top-N success rate; fewer where fewer candidates are right.
+        n_frames: of each clip, evenly spaced.
+        n_repeats: clips per object that specify the goal in turn.
+        max_clips: per object, default all.
+        precision: of the embedder.
+        device: of the embedder.
+        on_progress: called with (clips embedded, clips in all).
+
+    Raises:
+        BadInput: there are no clips, or no object has enough of them.
+    """
+    goal_folder = goals or folder
+    within = goal_folder.resolve() == folder.resolve()
+    clips = find_clips(folder, template)
+    goal_clips = clips if within else find_clips(goal_folder, template)
+    specified = {clip.thing for clip in goal_clips}
+    things = [thing for thing in enough(clips, 3 if within else 2) if thing in specified]
+    if not things:
+        raise BadInput(f"no object has 2 clips in {folder} to choose from and 1 other in {goal_folder} for the goal")
+    left_out = dict.fromkeys(clip.thing for clip in (*clips, *goal_clips) if clip.thing not in things)
+    clips = _first_of_each(clips, things, max_clips)
+    goal_clips = clips if within else _first_of_each(goal_clips, things, max_clips)
+    network = load_embedder(embedder, device=device, precision=precision)
+    distinct = clips if within else [*clips, *goal_clips]
+    numbers = itertools.count(1)
+
+    def on_done() -> None:
+        if on_progress is not None:
+            on_progress(next(numbers), len(distinct))
+
+    vectors = embed_clips(distinct, network, n_frames, on_done)
+    embeddings, goal_embeddings = vectors[: len(clips)], vectors[-len(goal_clips) :]
+    objects = {}
+    for thing in things:
+        of_thing = [i for i, clip in enumerate(goal_clips) if clip.thing == thing]
+        tops, variations, ratios, picked = [], [], [], []
+        for repeat, goal in enumerate(np.random.default_rng(0).permutation(of_thing)[:n_repeats].tolist()):
+            frames = candidates(
+                clips,
+                embeddings,
+                thing,
+                diverse=pool == "all",
+                any_thing=ask == "actions",
+                same_context=context == "same",
+                left_out=goal if within else None,
+                seed=repeat,
+            )
+            start_and_goal = goal_embeddings[goal][:1], goal_embeddings[goal][-1:]
+            scores = frames.scores(*start_and_goal, features, similarity)
+            tops.append(selection.top_up_to(scores, frames.satisfies, top))
+            variations.append(selection.relative_variation(scores, frames.satisfies))
+            ratios.append(selection.goal_frame_ratio(frames.satisfies))
+            picked.append(min(top, int(frames.satisfies.sum())))
+        objects[thing] = ObjectSelection(
+            bootstrap([np.array(tops)]),
+            bootstrap([np.array(variations)]),
+            float(np.mean(ratios)),
+            min(picked),
+            len(tops),
+            sum(clip.thing == thing for clip in clips),
+        )
+    return ClipSelection(objects, tuple(left_out), len(clips), network.fingerprint)
+
+
+def _first_of_each(clips: Sequence[Clip], things: Sequence[str], most: int | None) -> list[Clip]:
+    """Return the first clips of each object."""
+    return [clip for thing in things for clip in [c for c in clips if c.thing == thing][:most]]

@@ -1,21 +1,24 @@
-"""Datasets → candidates of goal and action selection, scored by one goal. What is found is judged by `selection`."""
+"""Datasets → candidates of goal and action selection, scored by one goal, judged by `zest_rl.metrics.selection`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.data.reader import open_dataset
+from zest_rl.embedders import DEFAULT_EMBEDDER, Precision
 from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.env import progress_of
-from zest_rl.kitchen.tasks import SUCCESS_PROGRESS, TASKS, Task
+from zest_rl.kitchen.tasks import SUCCESS_PROGRESS, TASKS, Task, get_task
 from zest_rl.kitchen.views import Views, canonical_states
-from zest_rl.metrics.selection import others
+from zest_rl.metrics import selection
 from zest_rl.rewards.scorer import ScorerConfig
+from zest_rl.rewards.scores import Features, Similarity
 from zest_rl.rewards.state_scorer import StateScorer
 
 Context = Literal["same", "different"]
@@ -63,7 +66,7 @@ class Candidates:
             raise BadInput(f"unknown context {context!r}; {nearest(context, ('same', 'different'))}")
         if len(self.starts) < 2:
             raise BadInput("a different trajectory to take x_0 from needs at least 2 trajectories, got 1")
-        return np.asarray(self.starts[others(len(self.starts), seed)[self.trajectory]])
+        return np.asarray(self.starts[selection.others(len(self.starts), seed)[self.trajectory]])
 
 
 def draw_candidates(dataset_ids: Sequence[str], n_frames: int, seed: int = 0) -> Candidates:
@@ -184,3 +187,118 @@ def score_as_actions(
             scorer = draw_goals(whole, n_goals, repeat)
             scores[repeat, frames] = scorer.score_pairs(first[frames], candidates.states[frames], on_progress)
     return scores
+
+
+@dataclass(frozen=True)
+class FrameSelection:
+    """The scores of candidates by one goal, and which of them reach it."""
+
+    task: str
+    """What the goal is of."""
+    top: int
+    """N of the Top-N success rate."""
+    scores: NDArray[np.float64]
+    """(R, M) of each candidate in each repeat."""
+    satisfies: NDArray[np.bool_]
+    """(M,) which candidates are right. Ground truth."""
+    trajectory: NDArray[np.intp]
+    """(M,) which trajectory each is of."""
+    starts_are_alike: bool
+    """Whether all trajectories start with the same picture, so that it makes no difference whose x_0 is taken."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the measures of `zest_rl.metrics.selection` with 95 % intervals over trajectories, and the counts."""
+        measures: dict[str, selection.Measure] = {
+            "top_n_success": partial(selection.top_up_to, n=self.top),
+            "dataset_total_variation": selection.dataset_total_variation,
+            "relative_variation": selection.relative_variation,
+        }
+        estimates = {
+            name: selection.over_trajectories(measure, self.scores, self.satisfies, self.trajectory)
+            for name, measure in measures.items()
+        }
+        chance = selection.goal_frame_ratio(self.satisfies)
+        return {
+            "top": self.top,
+            "n_repeats": len(self.scores),
+            "top_n_by_repeat": [selection.top_up_to(scores, self.satisfies, self.top) for scores in self.scores],
+            **{name: estimate.as_json() for name, estimate in estimates.items()},
+            "goal_frame_ratio": chance,
+            "times_random": estimates["top_n_success"].value / chance,
+            "n_candidates": len(self.satisfies),
+            "n_satisfying": int(self.satisfies.sum()),
+        }
+
+
+def select_frames(
+    datasets: Sequence[str],
+    *,
+    ask: Literal["goals", "actions"] = "goals",
+    task: str | None = None,
+    goal: str = "same-scene",
+    embedder: str = DEFAULT_EMBEDDER,
+    features: Features = "delta",
+    similarity: Similarity = "cos",
+    views: int = 8,
+    show_robot: bool = False,
+    tolerance: float = 1e-3,
+    context: Context = "same",
+    top: int = selection.TOP_N,
+    n_frames: int = 500,
+    n_goals: int | None = None,
+    n_repeats: int = 5,
+    seed: int = 0,
+    precision: Precision = "auto",
+    n_workers: int | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> FrameSelection:
+    """Draw frames of kitchen datasets and score them by a goal: do the highest scores find what the goal asks for?
+
+    Args:
+        datasets: whose frames are the candidates: one (the paper's narrow pool) or several tasks (diverse).
+        ask: goals: is the goal reached (Cui et al. §4.1)? actions: is its action done, to whatever object (§4.2)?
+        task: what the goal is of; default the task of the first dataset.
+        goal: as in `zest_rl.rewards.goals`.
+        embedder: URI of the network.
+        features: how frames and goals are compared.
+        similarity: how frames and goals are compared.
+        views: cameras around the object.
+        show_robot: keep the robot in view.
+        tolerance: rad or m, below which states are embedded once.
+        context: goals only: where x_0 of a candidate comes from.
+        top: N of the Top-N success rate.
+        n_frames: candidates drawn from each dataset.
+        n_goals: pictures of the goal drawn per repeat, default all.
+        n_repeats: R; 1 when nothing is drawn anew.
+        seed: of the candidates.
+        precision: of the embedder.
+        n_workers: processes that embed, default one per core.
+        on_progress: called with (parts embedded, parts in all).
+
+    Raises:
+        BadInput: an argument is out of range, or fewer than `top` candidates are right.
+    """
+    if not datasets:
+        raise BadInput("a selection needs at least 1 dataset; `zest collect` makes them")
+    candidates = draw_candidates(datasets, n_frames, seed)
+    wanted = get_task(task or candidates.task[0])
+    satisfies = candidates.satisfies(wanted) if ask == "goals" else candidates.does(wanted)
+    if satisfies.sum() < top:
+        raise BadInput(
+            f"only {satisfies.sum()} of {len(satisfies)} candidates satisfy the goal of {wanted.name!r}, so the "
+            f"highest {top} could not all; give more --n-frames, a smaller --top, or a dataset with more successes"
+        )
+    seen_from = Views(wanted.name, views, robot=show_robot, tolerance=tolerance)
+    config = ScorerConfig(goal, embedder, features, similarity, precision)
+    options: dict[str, Any] = {
+        "n_repeats": 1 if n_goals is None and context == "same" else n_repeats,
+        "n_goals": n_goals,
+        "n_workers": n_workers,
+        "on_progress": on_progress,
+    }
+    if ask == "goals":
+        scores = score_as_goals(candidates, config, seen_from, context=context, **options)
+    else:
+        scores = score_as_actions(candidates, config, seen_from, **options)
+    alike = candidates.start_alike(seen_from)
+    return FrameSelection(wanted.name, top, scores, satisfies, candidates.trajectory, alike)

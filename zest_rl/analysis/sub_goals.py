@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.analysis.clip_selection import Clip, embed_clips
+from zest_rl.analysis.clips import Clip, embed_clips
 from zest_rl.analysis.episode_view import N_FRAMES, EpisodeView
 from zest_rl.data.images import read_image
 from zest_rl.data.video import evenly_spaced, read_frames

@@ -1,0 +1,159 @@
+"""Real video by object: clips as files or as folders of pictures, and folders laid out as Something-Something V2."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from zest_rl.data.video import VIDEO_SUFFIXES, read_frames
+from zest_rl.embedders import Embedder
+from zest_rl.errors import BadInput, nearest
+from zest_rl.runtime import artifacts
+from zest_rl.runtime.arrays import read_arrays, write_arrays
+from zest_rl.runtime.parallel import one_thread
+from zest_rl.types import FloatArray
+
+OPENING = "Opening [something]"
+OBJECTS = ("door", "drawer", "box", "fridge", "laptop", "washing machine", "oven")
+"""The seven objects of the paper."""
+CALLED = {
+    "box": "box(es)?",
+    "fridge": "(fridge|refrigerator)s?",
+    "laptop": "laptops?( computers?)?",
+    "oven": "(?<!microwave )ovens?",
+}
+"""What labels call an object, where it is not its name alone or with an s."""
+VIDEOS = "20bn-something-something-v2"
+LABELS = tuple(
+    f"{folder}{prefix}{part}.json"
+    for folder in ("", "labels/")
+    for prefix in ("something-something-v2-", "")
+    for part in ("train", "validation")
+)
+"""Where the labels of its releases stand."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One video of one object."""
+
+    path: Path
+    """A video file, or a folder of pictures in the order of their names."""
+    thing: str
+    """What is acted on."""
+
+
+def find_clips(root: Path, template: str = OPENING) -> list[Clip]:
+    """Find the clips in a folder of either layout: `something_something` or `folder_of_clips`.
+
+    Args:
+        root: the folder.
+        template: the action; in a folder by object all clips are of it.
+
+    Raises:
+        BadInput: there is none.
+    """
+    return something_something(root, template=template) if (root / VIDEOS).exists() else folder_of_clips(root)
+
+
+def something_something(root: Path, things: Sequence[str] = OBJECTS, template: str = OPENING) -> list[Clip]:
+    """Find the clips of one action on some objects in a folder laid out as Something-Something V2.
+
+    The folder holds ``20bn-something-something-v2/ID.webm`` and one of `LABELS`, lists of ``{"id", "template",
+    "placeholders"}``. A clip is of what its first placeholder ends with: "a kitchen drawer" is a drawer, "the fridge
+    door" a fridge.
+
+    Raises:
+        BadInput: the layout is another one, or no clip is found.
+    """
+    files = [root / name for name in LABELS if (root / name).is_file()]
+    if not files or not (root / VIDEOS).is_dir():
+        raise BadInput(f"{root} must hold {VIDEOS}/ and {LABELS[0]} (or {LABELS[-2]}), as Something-Something V2 does")
+    clips, templates = [], set()
+    for file in files:
+        try:
+            entries = json.loads(file.read_text(encoding="utf-8"))
+            for entry in entries:
+                templates.add(entry["template"])
+                if entry["template"] == template:
+                    thing = _named(str(entry["placeholders"][0]).lower().strip(), things)
+                    path = root / VIDEOS / f"{entry['id']}.webm"
+                    if thing is not None and path.is_file():
+                        clips.append(Clip(path, thing))
+        except (ValueError, KeyError, TypeError, IndexError) as error:
+            raise BadInput(f"{file} is not a list of labels ({error!r}); download it again") from error
+    if template not in templates:
+        raise BadInput(f"no clip is of {template!r}; {nearest(template, templates)}")
+    if not clips:
+        raise BadInput(f"{root} has no video of {template!r} with {', '.join(things)}")
+    return clips
+
+
+def _named(words: str, things: Sequence[str]) -> str | None:
+    """Return which thing a label names, if any."""
+
+    def ends(text: str) -> str | None:
+        called = {thing: CALLED.get(thing, f"{re.escape(thing)}s?") for thing in things}
+        return next((thing for thing, name in called.items() if re.search(rf"\b({name})$", text)), None)
+
+    return ends(re.sub(r"\s+doors?$", "", words)) or ends(words)
+
+
+def folder_of_clips(root: Path) -> list[Clip]:
+    """Find clips that are sorted by object: ``ROOT/OBJECT/CLIP.mp4``, or ``ROOT/OBJECT/CLIP/`` with pictures.
+
+    Raises:
+        BadInput: there is none.
+    """
+    clips = [
+        Clip(path, thing.name)
+        for thing in _visible(root)
+        if thing.is_dir()
+        for path in _visible(thing)
+        if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES
+    ]
+    if not clips:
+        raise BadInput(
+            f"{root} must hold a folder per object with videos, or folders of pictures, in it, or {VIDEOS}/ and labels "
+            "as Something-Something V2 does"
+        )
+    return clips
+
+
+def _visible(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if not path.name.startswith(".")) if folder.is_dir() else []
+
+
+def embed_clips(
+    clips: Sequence[Clip], embedder: Embedder, n_frames: int, on_done: Callable[[], object] = lambda: None
+) -> list[FloatArray]:
+    """Embed clips, each once: what was embedded is kept in the cache, by content.
+
+    Args:
+        clips: what to embed.
+        embedder: the network.
+        n_frames: of each clip.
+        on_done: called after each clip.
+
+    Returns:
+        (n, D) float32 per clip.
+    """
+    vectors = []
+    for clip in clips:
+        parts = sorted(clip.path.iterdir()) if clip.path.is_dir() else [clip.path]
+        content = [artifacts.hash_file(path) for path in parts if path.is_file()]
+        digest = artifacts.hash_json([content, embedder.fingerprint, n_frames])
+        path = artifacts.cache_dir() / "clips" / f"{digest[:20]}.npz"
+        cached = read_arrays(path)
+        if cached is None:
+            with one_thread():
+                cached = {"embeddings": embedder.embed_images(read_frames(clip.path, n_frames))}
+            write_arrays(path, cached)
+        vectors.append(np.asarray(cached["embeddings"], dtype=np.float32))
+        on_done()
+    return vectors
