@@ -98,20 +98,18 @@ SEEDS: Mapping[str, int] = {f"part-{seed}": seed for seed in range(4)}
 
 def test_finished_parts_are_not_done_again_and_are_still_reported(tmp_path: Path) -> None:
     calls: list[int] = []
-    done: list[str] = []
-    cached_jobs(counted(calls), {"part-0": 0, "part-1": 1}, tmp_path, n_workers=1, on_done=done.append)
-    cached_jobs(counted(calls), SEEDS, tmp_path, n_workers=1, on_done=done.append)
+    assert list(cached_jobs(counted(calls), {"part-0": 0, "part-1": 1}, tmp_path, n_workers=1)) == ["part-0", "part-1"]
+    assert list(cached_jobs(counted(calls), SEEDS, tmp_path, n_workers=1)) == list(SEEDS)
     assert calls == [0, 1, 2, 3]
-    assert done == ["part-0", "part-1", *SEEDS]
 
 
 def test_a_damaged_part_is_done_again(tmp_path: Path) -> None:
     calls: list[int] = []
-    cached_jobs(counted(calls), SEEDS, tmp_path, n_workers=1)
+    list(cached_jobs(counted(calls), SEEDS, tmp_path, n_workers=1))
     before = numbers(tmp_path)
     damaged = tmp_path / "part-2.npz"
     damaged.write_bytes(damaged.read_bytes()[:-100])
-    cached_jobs(counted(calls), SEEDS, tmp_path, n_workers=1)
+    list(cached_jobs(counted(calls), SEEDS, tmp_path, n_workers=1))
     assert calls == [0, 1, 2, 3, 2]
     assert numbers(tmp_path) == before
 
@@ -121,7 +119,7 @@ def test_a_failing_job_keeps_the_parts_before_it(tmp_path: Path) -> None:
         return refuse(seed) if seed == 2 else draw(seed)
 
     with pytest.raises(BadInput, match="seed 2 is refused"):
-        cached_jobs(work, SEEDS, tmp_path, n_workers=1)
+        list(cached_jobs(work, SEEDS, tmp_path, n_workers=1))
     assert numbers(tmp_path).keys() == {"part-0", "part-1"}
 
 
@@ -129,14 +127,12 @@ def test_a_failing_job_keeps_the_parts_before_it(tmp_path: Path) -> None:
 
 
 def test_two_processes_leave_the_same_numbers_as_one(tmp_path: Path) -> None:
-    done: list[str] = []
-    cached_jobs(draw, SEEDS, tmp_path / "one", n_workers=1)
-    cached_jobs(draw, SEEDS, tmp_path / "two", n_workers=2, on_done=done.append)
+    assert list(cached_jobs(draw, SEEDS, tmp_path / "one", n_workers=1)) == list(SEEDS)
+    assert sorted(cached_jobs(draw, SEEDS, tmp_path / "two", n_workers=2)) == sorted(SEEDS)
     assert numbers(tmp_path / "two") == numbers(tmp_path / "one")
     assert numbers(tmp_path / "one").keys() == SEEDS.keys()
     assert processes(tmp_path / "one") == {os.getpid()}, "one worker is this process"
     assert os.getpid() not in processes(tmp_path / "two")
-    assert sorted(done) == sorted(SEEDS)
 
 
 @pytest.mark.parametrize("n_workers", [1, 2])
@@ -153,9 +149,9 @@ def test_jobs_without_a_cache_yield_their_results_by_name_and_leave_no_file(
 
 def test_what_the_jobs_share_is_sent_to_each_worker_once_and_not_with_each_job(tmp_path: Path) -> None:
     Shared.n_sent = 0
-    cached_jobs(partial(draw_with, Shared()), SEEDS, tmp_path / "two", n_workers=2)
+    list(cached_jobs(partial(draw_with, Shared()), SEEDS, tmp_path / "two", n_workers=2))
     assert Shared.n_sent == 2
-    cached_jobs(draw, SEEDS, tmp_path / "one", n_workers=1)
+    list(cached_jobs(draw, SEEDS, tmp_path / "one", n_workers=1))
     assert numbers(tmp_path / "two") == numbers(tmp_path / "one")
 
 
@@ -165,7 +161,7 @@ def test_workers_use_one_thread_each_and_this_process_keeps_its_setting(
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
     (tmp_path / "present").mkdir()
-    cached_jobs(read_n_threads, dict.fromkeys("ab", tmp_path / "present"), tmp_path, n_workers=2)
+    list(cached_jobs(read_n_threads, dict.fromkeys("ab", tmp_path / "present"), tmp_path, n_workers=2))
     parts = [read_arrays(path) or {} for path in tmp_path.glob("*.npz")]
     assert [list(part["threads"]) for part in parts] == [[1, 1, 1], [1, 1, 1]]
     assert os.environ["OMP_NUM_THREADS"] == "2"
@@ -178,7 +174,7 @@ def test_a_script_needs_no_main_guard(tmp_path: Path, monkeypatch: pytest.Monkey
         "import sys; from pathlib import Path; from zest_rl.runtime.parallel import cached_jobs\n"
         "from test_parallel import draw\n"
         "print('begun')\n"
-        "cached_jobs(draw, {str(i): i for i in range(4)}, Path(sys.argv[1]), n_workers=2)\n"
+        "list(cached_jobs(draw, {str(i): i for i in range(4)}, Path(sys.argv[1]), n_workers=2))\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
     command = [sys.executable, str(script), str(tmp_path)]
@@ -189,22 +185,22 @@ def test_a_script_needs_no_main_guard(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_a_killed_worker_is_a_clear_error_and_finished_parts_are_kept(tmp_path: Path) -> None:
     work = partial(be_killed_after_the_first, os.getpid(), tmp_path)
     with pytest.raises(ZestError, match=r"a worker process died .*finished parts are kept, run the same command again"):
-        cached_jobs(work, SEEDS, tmp_path, n_workers=2)
+        list(cached_jobs(work, SEEDS, tmp_path, n_workers=2))
     finished = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
     assert 1 <= len(finished) <= 3
-    cached_jobs(work, SEEDS, tmp_path, n_workers=1)
+    list(cached_jobs(work, SEEDS, tmp_path, n_workers=1))
     assert {path: path.stat().st_mtime_ns for path in finished} == finished
     assert len(list(tmp_path.iterdir())) == 4
 
 
 def test_an_error_of_a_worker_arrives_as_what_it_is(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"seed \d is refused"):
-        cached_jobs(refuse, SEEDS, tmp_path, n_workers=2)
+        list(cached_jobs(refuse, SEEDS, tmp_path, n_workers=2))
 
 
 def test_work_that_cannot_be_sent_is_an_error_and_no_wait(tmp_path: Path) -> None:
     with pytest.raises(Exception, match=r"(?i)pickle|local object"):
-        cached_jobs(counted([]), SEEDS, tmp_path, n_workers=3)
+        list(cached_jobs(counted([]), SEEDS, tmp_path, n_workers=3))
 
 
 @pytest.mark.parametrize("end", [os.kill, os.killpg], ids=["killed", "interrupted"])
@@ -216,7 +212,7 @@ def test_workers_end_with_a_command_that_is_killed_or_interrupted(
         "import sys; from pathlib import Path; from zest_rl.runtime.parallel import cached_jobs\n"
         "from test_parallel import beat\n"
         "folder = Path(sys.argv[1])\n"
-        "cached_jobs(beat, {str(i): folder / f'heart-{i}' for i in range(5)}, folder, n_workers=2)"
+        "list(cached_jobs(beat, {str(i): folder / f'heart-{i}' for i in range(5)}, folder, n_workers=2))"
     )
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
     command = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], start_new_session=True)

@@ -59,7 +59,7 @@ def test_an_address_where_no_cluster_answers_is_named_and_not_replaced(
 ) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:9")
     with pytest.raises(ZestError, match=r"the Ray cluster at RAY_ADDRESS=127\.0\.0\.1:9 cannot be joined"):
-        cached_jobs(draw, JOBS, tmp_path, engine="ray")
+        list(cached_jobs(draw, JOBS, tmp_path, engine="ray"))
 
 
 @pytest.fixture(scope="module")
@@ -90,13 +90,11 @@ def products(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.usefixtures("cluster")
 def test_ray_leaves_what_the_local_engine_leaves_and_does_nothing_twice(tmp_path: Path) -> None:
-    cached_jobs(draw, JOBS, tmp_path / "here", n_workers=1)
-    done: list[str] = []
-    cached_jobs(draw, {"part-2": 2}, tmp_path / "ray", engine="ray")
+    list(cached_jobs(draw, JOBS, tmp_path / "here", n_workers=1))
+    list(cached_jobs(draw, {"part-2": 2}, tmp_path / "ray", engine="ray"))
     before = (tmp_path / "ray/part-2.npz").stat().st_mtime_ns
-    cached_jobs(draw, JOBS, tmp_path / "ray", engine="ray", n_workers=2, on_done=done.append)
+    assert sorted(cached_jobs(draw, JOBS, tmp_path / "ray", engine="ray", n_workers=2)) == sorted(JOBS)
     assert products(tmp_path / "ray") == products(tmp_path / "here")
-    assert sorted(done) == sorted(JOBS)
     assert (tmp_path / "ray/part-2.npz").stat().st_mtime_ns == before
     processes = {int(part["process"][0]) for path in tmp_path.glob("ray/*.npz") if (part := read_arrays(path))}
     assert os.getpid() not in processes
@@ -105,7 +103,7 @@ def test_ray_leaves_what_the_local_engine_leaves_and_does_nothing_twice(tmp_path
 @pytest.mark.usefixtures("cluster")
 def test_a_refusal_arrives_as_it_was_raised_and_what_was_done_is_kept(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="seed 4 is refused"):
-        cached_jobs(refuse_the_last, JOBS, tmp_path / "parts", engine="ray", n_workers=1)
+        list(cached_jobs(refuse_the_last, JOBS, tmp_path / "parts", engine="ray", n_workers=1))
     assert products(tmp_path / "parts").keys() == JOBS.keys() - {"part-4"}
 
 
@@ -113,8 +111,8 @@ def test_a_refusal_arrives_as_it_was_raised_and_what_was_done_is_kept(tmp_path: 
 def test_a_worker_that_is_killed_loses_nothing(tmp_path: Path) -> None:
     (tmp_path / "begun").mkdir()
     jobs = {name: (seed, tmp_path / "begun") for name, seed in JOBS.items() if seed < 2}
-    cached_jobs(die_once, jobs, tmp_path / "parts", engine="ray", n_workers=1)
-    cached_jobs(draw, {name: JOBS[name] for name in jobs}, tmp_path / "here", n_workers=1)
+    list(cached_jobs(die_once, jobs, tmp_path / "parts", engine="ray", n_workers=1))
+    list(cached_jobs(draw, {name: JOBS[name] for name in jobs}, tmp_path / "here", n_workers=1))
     assert len(list((tmp_path / "begun").iterdir())) == 2
     assert products(tmp_path / "parts") == products(tmp_path / "here")
 
@@ -123,7 +121,7 @@ def test_a_worker_that_is_killed_loses_nothing(tmp_path: Path) -> None:
 def test_a_job_that_kills_every_worker_ends_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ray_engine, "MAX_RETRIES", 0)
     with pytest.raises(ZestError, match=r"Ray could not finish the work .* run the same command again to go on"):
-        cached_jobs(die_always, {"part-0": 0}, tmp_path, engine="ray", n_workers=1)
+        list(cached_jobs(die_always, {"part-0": 0}, tmp_path, engine="ray", n_workers=1))
 
 
 @pytest.mark.usefixtures("cluster")
@@ -146,17 +144,17 @@ def test_the_kitchen_is_relabeled_on_ray_to_the_same_rewards(
 @pytest.mark.usefixtures("cluster")
 def test_a_gpu_that_no_worker_has_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="the Ray cluster has no GPU; use cpu or auto"):
-        cached_jobs(draw, JOBS, tmp_path, engine="ray", device="cuda")
+        list(cached_jobs(draw, JOBS, tmp_path, engine="ray", device="cuda"))
 
 
 def test_a_gpu_cannot_be_chosen_by_its_number(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="each worker has one GPU, which it calls cuda, got device 'cuda:1'"):
-        cached_jobs(draw, JOBS, tmp_path, engine="ray", device="cuda:1")
+        list(cached_jobs(draw, JOBS, tmp_path, engine="ray", device="cuda:1"))
 
 
 def test_an_unknown_engine_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"unknown engine 'rya'; did you mean 'ray'\?"):
-        cached_jobs(draw, JOBS, tmp_path, engine="rya")  # type: ignore[arg-type]
+        list(cached_jobs(draw, JOBS, tmp_path, engine="rya"))  # type: ignore[arg-type]
 
 
 def test_an_embedder_that_is_another_on_the_worker_is_refused() -> None:
@@ -170,4 +168,4 @@ def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Monk
     find = importlib.util.find_spec
     monkeypatch.setattr(ray_engine.importlib.util, "find_spec", lambda name: None if name == "ray" else find(name))
     with pytest.raises(BadInput, match=r"pip install 'zest-rl\[ray\]'"):
-        cached_jobs(draw, JOBS, tmp_path, engine="ray")
+        list(cached_jobs(draw, JOBS, tmp_path, engine="ray"))

@@ -286,13 +286,9 @@ def evaluate(
     for part in chunks(config.n_episodes, max(EPISODES_PER_JOB, config.n_episodes // N_JOBS)):
         seeds = range(config.seed + part.start, config.seed + part.stop)
         jobs[f"seeds-{seeds.start}-{seeds.stop}{'-scored' if scored else ''}"] = (run, config, seeds, scored, device)
-    cached_jobs(
-        _evaluate_part,
-        jobs,
-        folder / "parts",
-        n_workers=n_workers,
-        on_done=None if on_progress is None else lambda name: on_progress(len(jobs[name][2])),
-    )
+    for name in cached_jobs(_evaluate_part, jobs, folder / "parts", n_workers=n_workers):
+        if on_progress is not None:
+            on_progress(len(jobs[name][2]))
     traces = read_parts(folder / "parts", jobs)
     dataset = policy.meta["dataset"]
     result = Evaluation(

@@ -166,13 +166,9 @@ def run_behaviour(
     for part in chunks(n_episodes, EPISODES_PER_JOB):
         indices = range(first + part.start, first + part.stop)
         jobs[f"episodes-{indices.start}-{indices.stop}"] = (behaviour, indices)
-    cached_jobs(
-        _rollouts,
-        jobs,
-        folder,
-        n_workers=n_workers,
-        on_done=None if on_progress is None else lambda name: on_progress(len(jobs[name][1])),
-    )
+    for name in cached_jobs(_rollouts, jobs, folder, n_workers=n_workers):
+        if on_progress is not None:
+            on_progress(len(jobs[name][1]))
     return read_parts(folder, jobs)
 
 

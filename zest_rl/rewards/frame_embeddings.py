@@ -21,7 +21,7 @@ from zest_rl.errors import BadInput, ZestError
 from zest_rl.rewards.embeddings import EmbeddedEpisode, check_same_embedder, shared_embedder
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_arrays
-from zest_rl.runtime.parallel import Engine, cached_jobs, counted, one_thread
+from zest_rl.runtime.parallel import Engine, cached_jobs, one_thread
 from zest_rl.sources.base import Frames, Source
 
 STEPS_PER_BATCH = 16
@@ -127,15 +127,17 @@ class FrameEmbeddings:
             for i, digest in enumerate(self._digests)
             if not self._path(digest).exists()
         }
-        cached_jobs(
+        embedded = cached_jobs(
             partial(_embed_episode, self._shared),
             jobs,
             self._folder,
             n_workers=self._n_workers,
             engine=self._engine,
             device=self._shared.device,
-            on_done=counted(on_progress, len(self._digests), len(self._digests) - len(jobs)),
         )
+        for n_done, _ in enumerate(embedded, start=len(self._digests) - len(jobs) + 1):
+            if on_progress is not None:
+                on_progress(n_done, len(self._digests))
         self.n_embedded += len(jobs)
 
     def __iter__(self) -> Iterator[EmbeddedEpisode]:

@@ -24,7 +24,7 @@ from zest_rl.kitchen.views import Views, canonical_states, distinct_states
 from zest_rl.rewards.embeddings import EmbeddedEpisode, check_same_embedder, shared_embedder
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_array, write_arrays
-from zest_rl.runtime.parallel import Engine, cached_jobs, chunks, counted, one_thread
+from zest_rl.runtime.parallel import Engine, cached_jobs, chunks, one_thread
 from zest_rl.simulation.views import state_keys
 from zest_rl.types import FloatArray
 
@@ -113,15 +113,12 @@ class StateEmbedder:
         for chunk in chunks(len(missing), STATES_PER_SHARD):
             part = missing[chunk.start : chunk.stop]
             jobs[artifacts.hash_arrays(part)[:20]] = _Job(self.config, part, self.embedder.fingerprint)
-        cached_jobs(
-            _embed_states,
-            jobs,
-            self.folder,
-            n_workers=self.n_workers,
-            engine=self.engine,
-            device=self.config.device,
-            on_done=counted(on_progress, len(jobs)),
+        embedded = cached_jobs(
+            _embed_states, jobs, self.folder, n_workers=self.n_workers, engine=self.engine, device=self.config.device
         )
+        for n_done, _ in enumerate(embedded, start=1):
+            if on_progress is not None:
+                on_progress(n_done, len(jobs))
         self.n_embedded += len(missing)
         self._find()
 

@@ -10,10 +10,10 @@ import multiprocessing
 import os
 import sys
 import threading
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -84,16 +84,6 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def counted(
-    on_progress: Callable[[int, int], None] | None, total: int, n_done: int = 0
-) -> Callable[[str], None] | None:
-    """Return what `cached_jobs` may call after each job, to tell `on_progress` of (jobs done, jobs in all)."""
-    if on_progress is None:
-        return None
-    numbers = itertools.count(n_done + 1)
-    return lambda _: on_progress(next(numbers), total)
-
-
 def run_jobs(
     work: Callable[[Job], Result],
     jobs: Mapping[str, Job],
@@ -101,7 +91,7 @@ def run_jobs(
     n_workers: int | None = None,
     engine: Engine = "local",
     device: str = "cpu",
-) -> Generator[tuple[str, Result], None, None]:
+) -> Iterator[tuple[str, Result]]:
     """Yield the name and the result of ``work(job)`` for every job, the first that is done first.
 
     A single local worker is this process; several are processes of their own, which use one thread each.
@@ -145,7 +135,7 @@ def _do(job: Any) -> Any:
 
 def _run_in_pool(
     work: Callable[[Job], Result], jobs: Mapping[str, Job], n_processes: int
-) -> Generator[tuple[str, Result], None, None]:
+) -> Iterator[tuple[str, Result]]:
     waiting = iter(jobs.items())
     running: dict[Future[Result], str] = {}  # never more than processes, as what a pool has taken it does to the end
     context = multiprocessing.get_context("spawn")  # fork is unsafe beside torch's and the GL library's threads
@@ -174,42 +164,32 @@ def cached_jobs(
     n_workers: int | None = None,
     engine: Engine = "local",
     device: str = "cpu",
-    on_done: Callable[[str], None] | None = None,
-) -> None:
-    """Leave the arrays of ``work(job)`` in ``folder/NAME.npz`` for every job; what is there already is not done again.
+) -> Iterator[str]:
+    """Leave the arrays of ``work(job)`` in ``folder/NAME.npz`` for every job, and yield its name when they are there.
 
-    Local workers write their results themselves; those of a cluster may have other disks, so this process writes.
-
-    Args:
-        work: as for `run_jobs`; it must depend on nothing but its job and what it is a partial of.
-        jobs: name → job. The name must identify the job's content.
-        folder: where results are left.
-        n_workers: as for `run_jobs`.
-        engine: as for `run_jobs`.
-        device: as for `run_jobs`.
-        on_done: called with the name of each job when its file is there, also for those found finished.
+    What is there already is not done again. Arguments are those of `run_jobs`; a job's name must identify its content,
+    and the work must depend on nothing else. Local workers write what they have done, so that nothing is lost with this
+    process; those of a cluster may have other disks, so this process writes.
 
     Raises:
         BadInput: `n_workers` is below 1, or there is no such engine.
         ZestError: a worker died (out of memory, killed). What was finished is kept.
     """
-    tell = on_done or (lambda name: None)
     missing = {}
     for name, job in jobs.items():
         if read_arrays(folder / f"{name}.npz") is None:
             missing[name] = (name, job)
         else:
-            tell(name)
+            yield name
     do = partial(_do_named, work, None if engine == "ray" else folder)
-    with closing(run_jobs(do, missing, n_workers=n_workers, engine=engine, device=device)) as results:
-        for name, arrays in results:
-            if arrays is not None:
-                write_arrays(folder / f"{name}.npz", arrays)
-            tell(name)
+    for name, arrays in run_jobs(do, missing, n_workers=n_workers, engine=engine, device=device):
+        if arrays is not None:
+            write_arrays(folder / f"{name}.npz", arrays)
+        yield name
 
 
 def _do_named(work: Callable[[Job], Arrays], folder: Path | None, named: tuple[str, Job]) -> Arrays | None:
-    """Do a job, and leave its arrays in the folder or return them."""
+    """Do a job; return its arrays, or leave them in the folder if there is one."""
     name, job = named
     arrays = work(job)
     if folder is None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import socket
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -46,17 +46,14 @@ class _Worker:
 
 def run_jobs(
     work: Callable[[Job], Result], jobs: Mapping[str, Job], *, n_workers: int | None = None, device: str = "cpu"
-) -> Generator[tuple[str, Result], None, None]:
+) -> Iterator[tuple[str, Result]]:
     """Yield the name and the result of ``work(job)`` for every job, the first that is done first.
 
     The cluster is that of ``RAY_ADDRESS``, or of the caller's own ``ray.init``; else one is started on this machine for
     the time of the work.
 
-    Args:
-        work: a module-level function, or a partial of one.
-        jobs: name → job, both picklable.
-        n_workers: workers at most; default one per GPU, or per core where there are none.
-        device: what the work runs on; unless it is ``cpu``, each worker gets a GPU of its own where there are any.
+    There are `n_workers` at most, by default one per GPU, or one per core where there are none. Unless `device` is
+    ``cpu``, each worker gets a GPU of its own where there are any.
 
     Raises:
         BadInput: Ray is not installed, or the device is not one that its workers have.

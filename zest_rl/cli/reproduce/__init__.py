@@ -319,7 +319,8 @@ def run_cells(cells: list[Cell], output: Path, ui: Ui, *, n_workers: int | None 
         ui.progress("updates of all cells (evaluation follows)", total) as advance,
         _TrainingWatch({cell.run for cell in open_cells.values()}, advance),
     ):
-        cached_jobs(_work, open_cells, done_folder, n_workers=n_workers, on_done=lambda name: ui.say(f"done: {name}"))
+        for name in cached_jobs(_work, open_cells, done_folder, n_workers=n_workers):
+            ui.say(f"done: {name}")
     return len(open_cells)
 
 
