@@ -32,7 +32,11 @@ def names(folder: Path) -> set[str]:
 def start(code: str, *arguments: object) -> subprocess.Popen[str]:
     """Run Python code in a process of its own; it has written "ready" when this returns."""
     process = subprocess.Popen(
-        [sys.executable, "-c", f"import os, sys, time\nfrom pathlib import Path\nfrom zest_rl.runtime import artifacts\n{code}"]
+        [
+            sys.executable,
+            "-c",
+            f"import os, sys, time\nfrom pathlib import Path\nfrom zest_rl.runtime import artifacts\n{code}",
+        ]
         + [str(argument) for argument in arguments],
         stdout=subprocess.PIPE,
         text=True,
