@@ -58,7 +58,8 @@ def make_run(agent: str, folder: Path) -> Path:
     """Train an agent of full size for one update on one episode of the expert; return its run folder."""
     recorded = rollout(Behaviour("micro", "expert"), 0)
     obs, actions, gt_reward = (recorded[name][0] for name in ("obs", "actions", "gt_reward"))
-    dataset = {"env_spec": env_spec("micro").to_json(), "ref_min_score": 0.0, "ref_max_score": 70.0, "zest": {}}
+    refs = {"ref_min_score": 0.0, "ref_max_score": 70.0}
+    dataset = {"id": "one-episode-v0", "env_spec": env_spec("micro").to_json(), **refs, "zest": {}}
     episode = Episode(obs, actions, np.asarray(gt_reward[1:], dtype=np.float32), terminated=False)
     config = TrainingConfig(n_updates=1, device="cpu")
     return fit(agent, AGENTS[agent].config(), [episode], folder / agent, config, meta={"dataset": dataset})

@@ -23,17 +23,16 @@ from zest_rl.errors import BadInput, ZestError
 from zest_rl.evaluation import evaluate as evaluation
 from zest_rl.evaluation.evaluate import (
     EPISODES_PER_JOB,
-    Arrays,
     EvaluationConfig,
     evaluate,
     evaluation_folder,
     read_evaluation,
-    rollout,
     target_return,
 )
+from zest_rl.evaluation.rollout import Arrays, run_episodes
 from zest_rl.kitchen.collect import env_spec
 from zest_rl.kitchen.env import ENV_ID, HORIZON, KitchenEnv
-from zest_rl.rewards.relabel import SCORER_FILE
+from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 
@@ -50,7 +49,9 @@ class Replay:
 
     def __init__(self, run: Path, actions: np.ndarray) -> None:
         self.policy = load_policy(run)
-        self.agent, self.meta, self.uses_return = self.policy.agent, self.policy.meta, self.policy.uses_return
+        self.agent, self.uses_return = self.policy.agent, self.policy.uses_return
+        dataset = self.policy.meta["dataset"] | {"env_spec": env_spec("micro").to_json()}  # of the full length
+        self.meta = self.policy.meta | {"dataset": dataset}
         self.actions = actions
         self.decided: list[np.ndarray] = []
         self.told: list[np.ndarray] = []
@@ -78,7 +79,9 @@ def replay(trained: Path) -> Callable[..., tuple[Replay, Arrays]]:
 
     def play(name: str, config: EvaluationConfig = ONLINE, scorer: StateScorer | None = None) -> tuple[Replay, Arrays]:
         policy = Replay(trained / name, actions)
-        return policy, rollout(policy, env_spec("micro").to_json(), range(seed, seed + 1), config, scorer)
+        target = target_return(policy, config)
+        seeds = range(seed, seed + 1)
+        return policy, run_episodes(policy, seeds, rtg=config.rtg, target_return=target, scorer=scorer)
 
     return play
 
@@ -241,7 +244,7 @@ def test_a_finished_evaluation_is_not_run_again_and_other_settings_have_a_folder
     trained: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = evaluate(trained / "bc-0", CONSTANT, n_workers=1)
-    monkeypatch.setattr(evaluation, "rollout", lambda *arguments: pytest.fail("it rolls out"))
+    monkeypatch.setattr(evaluation, "run_episodes", lambda *arguments, **options: pytest.fail("it rolls out"))
     again = evaluate(trained / "bc-0", CONSTANT, n_workers=1)
     assert_equal(again.traces, first.traces)
     folders = {evaluation_folder(trained, replace(CONSTANT, **change)) for change in (
@@ -282,7 +285,7 @@ def test_scores_without_a_scorer_are_refused_before_anything_runs(trained: Path)
     with pytest.raises(BadInput, match=r"dt-0 has no zest_scorer.safetensors"):
         evaluate(trained / "dt-0", ONLINE)
     with pytest.raises(BadInput, match="rtg 'online' needs a scorer; give it"):
-        rollout(load_policy(trained / "dt-0"), env_spec("micro").to_json(), range(1), ONLINE)
+        run_episodes(load_policy(trained / "dt-0"), range(1))
     assert not (trained / "dt-0" / "evaluations").exists()
 
 

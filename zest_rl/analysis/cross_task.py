@@ -14,7 +14,7 @@ from zest_rl.analysis.reward_figures import FIGURES
 from zest_rl.data.reader import dataset_path
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.metrics.statistics import bootstrap
-from zest_rl.rewards.relabel import SCORER_FILE
+from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.types import FloatArray
 

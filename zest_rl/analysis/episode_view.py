@@ -12,7 +12,7 @@ from zest_rl.analysis.inspection import Inspection
 from zest_rl.data.reader import dataset_path
 from zest_rl.data.video import evenly_spaced
 from zest_rl.kitchen.views import canonical_states
-from zest_rl.rewards.relabel import SCORER_FILE
+from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.types import FloatArray
 

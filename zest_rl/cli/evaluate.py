@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -41,41 +42,29 @@ class Config:
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Roll out, summarise, write videos."""
-    import time
-
-    from zest_rl.evaluation.evaluate import evaluate, evaluation_folder
-    from zest_rl.kitchen.videos import Video, ensure_videos
-    from zest_rl.metrics.statistics import representative
+    from zest_rl.evaluation.evaluate import episode_videos, evaluate, evaluation_folder
 
     started = time.monotonic()
-    what = settings(config)
     with ui.progress("episodes", config.n_episodes) as advance:
         result = evaluate(
             config.run,
-            what,
+            settings(config),
             score=config.score,
+            videos=config.videos,
             device=config.device,
             n_workers=config.n_workers,
             on_progress=advance,
         )
-    folder = evaluation_folder(config.run, what)
-    seconds = time.monotonic() - started
-    summary = result.summary()
-    if summary.get("clipped_actions"):
-        ui.warn(
-            f"{summary['clipped_actions']:.1%} of the actions left [-1, 1] and were clipped, as the environment does"
-        )
-    videos = {}
-    if config.videos:
-        shown = representative(result.normalized())
-        videos = {name: Video(result.traces["qpos"][index], folder / f"{name}.mp4") for name, index in shown.items()}
-        ensure_videos(videos.values(), n_workers=config.n_workers)
+    summary, folder = result.summary(), evaluation_folder(config.run, result.config)
+    if clipped := summary.get("clipped_actions"):
+        ui.warn(f"{clipped:.1%} of the actions left [-1, 1] and were clipped, as the environment does")
+    videos = {name: str(folder / video.path.name) for name, video in episode_videos(result).items()}
     return {
         "run": str(config.run),
         **summary,
         "result": str(folder / "result.json"),
-        "videos": {name: str(video.path) for name, video in videos.items()},
-        "seconds": round(seconds, 2),
+        "videos": videos if config.videos else {},
+        "seconds": round(time.monotonic() - started, 2),
         "next": f"zest report {shlex.quote(str(config.run))}",
     }
 

@@ -36,12 +36,8 @@ def __getattr__(name: str) -> Any:
 def _with_arguments(agent: str, agent_class: type[Any]) -> type[Any]:
     from zest_rl.training.loop import TrainingConfig
 
-    members = {
-        "agent": agent,
-        "__doc__": f"Train {(agent_class.__doc__ or agent).splitlines()[0]}",
-        "__annotations__": {},
-        "__post_init__": _parts,  # both parts check themselves
-    }
+    summary = f"Train {(agent_class.__doc__ or agent).splitlines()[0]}"
+    members = {"agent": agent, "__doc__": summary, "__annotations__": {}, "__post_init__": _parts}  # parts check values
     bases = (Arguments, TrainingConfig, agent_class)
     return dataclass(frozen=True, kw_only=True)(type(f"{agent_class.__name__}Arguments", bases, members))
 
@@ -58,6 +54,7 @@ def _parts(config: Any) -> tuple[Any, Any]:
 
 def run(config: Arguments, ui: Ui) -> dict[str, Any]:
     """Train, or go on training; of several processes under ``torchrun`` the first one tells."""
+    from zest_rl.data.provenance import DatasetRecord
     from zest_rl.evaluation.evaluate import is_evaluable
     from zest_rl.runtime import artifacts
     from zest_rl.training.runs import default_run_dir, train
@@ -67,14 +64,17 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
     run_dir = config.run_dir or default_run_dir(config.agent, config.dataset, training.seed)
     ui.say(f"training in {run_dir}")
     with ui.progress(f"{config.agent} updates", training.n_updates) as advance:
-        show = lambda n, **row: advance(n, loss=row["loss"])  # noqa: E731
+
+        def show(n: int, **row: float) -> None:
+            advance(n, loss=row["loss"])
+
         train(config.agent, config.dataset, agent_config, training, run_dir=run_dir, on_progress=show)
     if not launched().leads:
         return {}
     meta = artifacts.read_json(run_dir / "meta.json")
-    quoted = shlex.quote(str(run_dir))
+    evaluable = is_evaluable(DatasetRecord.from_description(meta["dataset"]))
     return {
         "run": str(run_dir),
         **{key: meta[key] for key in ("agent", "n_params", "n_updates", "train_seconds")},
-        "next": f"zest evaluate {quoted}" if is_evaluable(meta["dataset"]) else f"zest export {config.dataset}",
+        "next": f"zest evaluate {shlex.quote(str(run_dir))}" if evaluable else f"zest export {config.dataset}",
     }

@@ -1,39 +1,35 @@
-"""Policy + environment (+ scorer for the online return-to-go) → episode results. Imports no training.
+"""A run → its policy's returns and success: which starts, by which rule, in which folder, and how results are read.
 
-Episodes run in lockstep within a part, one part per core at a time; every policy meets the same starts (paired
-seeds). The Decision Transformer's return-to-go falls by the *online ZeST score* of each new state, in the units of the
-rewards it was trained on. Ground-truth rewards are recorded, and shown to no policy but one that was trained on them.
+All policies meet the same starts (paired seeds). Episodes run in parts, one part per core at a time.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.agents import Policy, load_policy
-from zest_rl.data.env_specs import check_env_spec, check_registered
 from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput, nearest
+from zest_rl.evaluation.rollout import Arrays, Rtg, run_episodes, uses_online_scores
 from zest_rl.kitchen.env import ENV_ID
-from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return, wilson
-from zest_rl.rewards.relabel import SCORER_FILE, Reward
+from zest_rl.kitchen.videos import Video, ensure_videos
+from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return, representative, wilson
+from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.parallel import cached_jobs, chunks, one_thread, read_parts
 from zest_rl.types import EpisodeResult
 
-Rtg = Literal["online", "constant", "schedule"]
 EPISODES_PER_JOB, N_JOBS = 5, 10
 """An evaluation is cut into `N_JOBS` parts of at least so many episodes: small enough that all cores have work and a
 cut evaluation loses little, large enough that a policy acts on a batch."""
-Arrays = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -44,7 +40,7 @@ class EvaluationConfig:
     seed: int = 1_000_000
     """Episode i resets the environment with seed + i; datasets use other seeds."""
     rtg: Rtg = "online"
-    """How the return-to-go falls: by the online ZeST score, not at all, or as in the best training episode."""
+    """How the return-to-go falls: online, constant or schedule (`Rtg`)."""
     target_quantile: float = 1.0
     """The target return is this quantile of the training returns: a rule fixed before evaluation."""
 
@@ -80,15 +76,20 @@ class Evaluation:
     """Ground-truth returns that are 0 % and 100 %."""
     episodes: tuple[EpisodeResult, ...]
     traces: Arrays
-    """gt_reward (N, T+1), qpos (N, T+1, nq), score (N, T+1) when scored online, and of a policy from elsewhere clipped
-    (N,), the number of actions that left [-1, 1]."""
+    """What `run_episodes` returns: gt_reward, gt_success (N, T+1), qpos (N, T+1, nq), score (N, T+1) when scored, and
+    of a foreign policy clipped (N,), the number of actions that left [-1, 1]."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the result and the videos are."""
+        return evaluation_folder(self.run, self.config)
 
     def normalized(self) -> NDArray[np.float64]:
         """Normalized return of each episode, in percent: (N,)."""
         return normalized_return(np.array([e.gt_return for e in self.episodes]), self.minimum, self.expert)
 
     def summary(self) -> dict[str, Any]:
-        """JSON-ready: mean with its interval, IQM, success rate; from elsewhere, the share of clipped actions."""
+        """JSON-ready: mean with its interval, IQM, success rate; of a foreign policy, the share of clipped actions."""
         values = self.normalized()
         success = wilson(sum(e.success for e in self.episodes), len(self.episodes))
         return {
@@ -112,116 +113,6 @@ def target_return(policy: Policy, config: EvaluationConfig) -> float | None:
     return float(np.interp(config.target_quantile, np.linspace(0, 1, len(quantiles)), quantiles))
 
 
-def uses_online_scores(policy: Policy, config: EvaluationConfig) -> bool:
-    """Whether each new state has to be scored while the policy acts."""
-    return policy.uses_return and config.rtg == "online" and _reward_kind(policy) is not None
-
-
-def _reward_kind(policy: Policy) -> Reward | None:
-    """How the rewards that the policy was trained on follow from scores; None when they are not ZeST scores."""
-    relabel = DatasetRecord.from_description(policy.meta["dataset"]).relabel
-    return None if relabel is None else relabel.reward
-
-
-def rollout(
-    policy: Policy, env_spec: str, seeds: range, config: EvaluationConfig, scorer: StateScorer | None = None
-) -> Arrays:
-    """Run one episode per seed, in lockstep.
-
-    Args:
-        policy: acts on all episodes at once.
-        env_spec: Gymnasium EnvSpec as JSON.
-        seeds: of the environments' resets.
-        config: how the return-to-go falls.
-        scorer: scores each new state; needed for ``rtg="online"`` with ZeST rewards.
-
-    Returns:
-        gt_reward (N, T+1) float32, gt_success (N, T+1) bool, qpos (N, T+1, nq), score (N, T+1) if scored, and what
-        the policy tells of its episodes at their end.
-
-    With ``rtg="online"`` the return-to-go of a policy that was trained on ground-truth rewards falls by those: the
-    upper bound of the comparison.
-
-    Raises:
-        BadInput: the environment is not the kitchen, or the policy needs scores and there is no scorer.
-    """
-    if scorer is None and uses_online_scores(policy, config):
-        raise BadInput(
-            "the policy was trained on ZeST scores, so rtg 'online' needs a scorer; give it, or use 'constant'"
-        )
-    spec = _kitchen_spec(env_spec)
-    horizon = spec.max_episode_steps
-    assert horizon is not None
-    envs = [gymnasium.make(spec) for _ in seeds]
-    resets = [env.reset(seed=seed) for env, seed in zip(envs, seeds, strict=True)]
-    obs = np.stack([o for o, _ in resets])
-    infos = [info for _, info in resets]
-    trace: dict[str, list[Any]] = {"gt_reward": [], "gt_success": [], "qpos": []}
-    first = np.stack([info["state"]["qpos"] for info in infos])
-    scores = [scorer.score_now(first, first)] if scorer is not None else []
-
-    def record() -> None:
-        trace["gt_reward"].append(np.array([info["gt"]["reward"] for info in infos]))
-        trace["gt_success"].append(np.array([info["gt"]["success"] for info in infos]))
-        trace["qpos"].append(np.stack([info["state"]["qpos"] for info in infos]))
-
-    record()
-    try:
-        policy.begin(len(envs), target_return(policy, config))
-        for step in range(horizon):
-            actions = policy.act(obs)
-            results = [env.step(action) for env, action in zip(envs, actions, strict=True)]
-            obs = np.stack([result[0] for result in results])
-            rewards = np.array([result[1] for result in results], dtype=np.float32)
-            infos = [result[4] for result in results]
-            record()
-            if scorer is not None:
-                scores.append(scorer.score_now(first, trace["qpos"][-1]))
-                level = _reward_kind(policy) != "difference"
-                rewards = scores[-1] if level else scores[-1] - scores[-2]
-            if policy.uses_return:
-                policy.observe(_decrement(policy, config, step, rewards))
-    finally:
-        told = policy.end()
-        for env in envs:
-            env.close()
-    arrays = {name: np.stack(values, axis=1) for name, values in trace.items()} | told
-    if scorer is not None:
-        arrays["score"] = np.stack(scores, axis=1)
-    return arrays
-
-
-def _kitchen_spec(env_spec: str) -> gymnasium.envs.registration.EnvSpec:
-    """Read the EnvSpec of a run; the run may come from somebody else, so it must not run code of its choice."""
-    check_env_spec(env_spec, "the environment of the run", "evaluate a run on a dataset of the kitchen")
-    spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
-    if spec.id != ENV_ID or spec.max_episode_steps is None:
-        raise BadInput(
-            f"evaluation needs {ENV_ID} with a horizon, got {spec.id} with max_episode_steps {spec.max_episode_steps}; "
-            "train on a dataset of `zest collect`"
-        )
-    check_registered(spec)
-    return spec
-
-
-def is_evaluable(dataset: Mapping[str, Any]) -> bool:
-    """Whether a run's dataset (`zest_rl.data.reader.Dataset.describe`) is of the environment that `evaluate` runs."""
-    record = DatasetRecord.from_description(dataset)
-    return not record.is_foreign or record.env.get("id") == ENV_ID
-
-
-def _decrement(
-    policy: Policy, config: EvaluationConfig, step: int, rewards: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """By how much the return-to-go of each episode falls after `step`."""
-    if config.rtg == "constant":
-        return np.zeros_like(rewards)
-    if config.rtg == "schedule":
-        schedule = np.asarray(policy.meta["rtg_schedule"], dtype=np.float32)
-        return np.full_like(rewards, schedule[step] - schedule[step + 1] if step + 1 < len(schedule) else 0.0)
-    return rewards
-
-
 @functools.lru_cache(maxsize=2)
 def _scorer(path: Path, sha256: str) -> StateScorer:
     """Load a scorer once per process; `sha256` tells a changed file apart."""
@@ -233,7 +124,7 @@ def _evaluate_part(job: tuple[Path, EvaluationConfig, range, bool, str]) -> Arra
     policy = load_policy(run, device=device)
     scorer = _scorer(run / SCORER_FILE, artifacts.hash_file(run / SCORER_FILE)) if scored else None
     with one_thread():
-        arrays = rollout(policy, policy.meta["dataset"]["env_spec"], seeds, config, scorer)
+        arrays = run_episodes(policy, seeds, rtg=config.rtg, target_return=target_return(policy, config), scorer=scorer)
     if scorer is not None:
         scorer.flush()
     return arrays
@@ -241,9 +132,10 @@ def _evaluate_part(job: tuple[Path, EvaluationConfig, range, bool, str]) -> Arra
 
 def evaluate(
     run: Path,
-    config: EvaluationConfig,
+    config: EvaluationConfig | None = None,
     *,
     score: bool = False,
+    videos: bool = False,
     device: str = "cpu",
     n_workers: int | None = None,
     on_progress: Callable[[int], None] | None = None,
@@ -251,9 +143,10 @@ def evaluate(
     """Evaluate the policy that a run ended with; finished parts are kept, so a cut evaluation goes on where it stopped.
 
     Args:
-        run: folder that `zest_rl.training` left.
-        config: seeds and return-to-go.
+        run: folder that `zest_rl.training.runs.train` or `zest_rl.training.adoption.adopt` left.
+        config: seeds and return-to-go; default `EvaluationConfig()`.
         score: also record ZeST scores where the policy does not need them.
+        videos: also write `episode_videos`.
         device: where the policy runs.
         n_workers: number of processes, default one per core.
         on_progress: called with the number of episodes that were finished.
@@ -263,21 +156,26 @@ def evaluate(
             scores are asked for.
         ZestError: a part of the run is damaged.
     """
+    config = EvaluationConfig() if config is None else config
     check_finished(run)
     run = run.resolve()
     policy = load_policy(run, device=device)
-    dataset = policy.meta["dataset"]
+    dataset = DatasetRecord.from_description(policy.meta["dataset"])
     if not is_evaluable(dataset):
-        dataset_id = dataset["id"]
         raise BadInput(
-            f"`zest evaluate` runs {ENV_ID} alone, and {run.name} was trained on {dataset_id}; act with it from Python "
-            f"(zest_rl.agents.load_policy), or hand the data to other code: zest export {dataset_id}"
+            f"`zest evaluate` runs {ENV_ID} alone, and {run.name} was trained on {dataset.id}; act with it from Python "
+            f"(zest_rl.agents.load_policy), or hand the data to other code: zest export {dataset.id}"
         )
-    scored = score or uses_online_scores(policy, config)
+    if dataset.ref_min_score is None or dataset.ref_max_score is None:
+        raise BadInput(
+            f"dataset {dataset.id} of {run.name} has no reference scores, so returns cannot be normalized; give both "
+            "when the dataset is made"
+        )
+    scored = score or uses_online_scores(policy, config.rtg)
     if scored and not (run / SCORER_FILE).exists():
         reason = (
             "its frames are from elsewhere, so scores cannot be made online; use --rtg constant"
-            if DatasetRecord.from_description(dataset).is_foreign
+            if dataset.is_foreign
             else "it was not trained on a relabeled dataset; use --rtg constant, or train on what `zest relabel` writes"
         )
         raise BadInput(f"scores are needed, but {run.name} has no {SCORER_FILE}: {reason}")
@@ -290,13 +188,12 @@ def evaluate(
         if on_progress is not None:
             on_progress(len(jobs[name][2]))
     traces = read_parts(folder / "parts", jobs)
-    dataset = policy.meta["dataset"]
     result = Evaluation(
         run,
         config,
         target_return(policy, config),
-        dataset["ref_min_score"],
-        dataset["ref_max_score"],
+        dataset.ref_min_score,
+        dataset.ref_max_score,
         _episode_results(traces, config),
         traces,
     )
@@ -312,7 +209,14 @@ def evaluate(
             "provenance": artifacts.provenance(),
         },
     )
+    if videos:
+        ensure_videos(episode_videos(result).values(), n_workers=n_workers)
     return result
+
+
+def is_evaluable(dataset: DatasetRecord) -> bool:
+    """Whether a run on this dataset is of the environment that `evaluate` runs."""
+    return not dataset.is_foreign or dataset.env.get("id") == ENV_ID
 
 
 def check_finished(run: Path) -> None:
@@ -351,6 +255,14 @@ def read_evaluation(folder: Path) -> Evaluation:
 def evaluation_folder(run: Path, config: EvaluationConfig) -> Path:
     """Where `evaluate` leaves its parts, ``result.json`` and videos."""
     return run / "evaluations" / artifacts.hash_json(asdict(config))[:8]
+
+
+def episode_videos(evaluation: Evaluation) -> dict[str, Video]:
+    """Return the videos of the best, the median and the worst episode, whether or not they are written yet."""
+    return {
+        which: Video(evaluation.traces["qpos"][index], evaluation.folder / f"{which}.mp4")
+        for which, index in representative(evaluation.normalized()).items()
+    }
 
 
 def _episode_results(traces: Arrays, config: EvaluationConfig) -> tuple[EpisodeResult, ...]:

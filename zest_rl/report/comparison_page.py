@@ -23,7 +23,7 @@ from zest_rl.report.episodes import episode_panels, paired_panels
 from zest_rl.report.goals import goal_panel, goal_scatter
 from zest_rl.report.methods import Method, goal_name, latest_evaluation, methods_of_runs, read_meta
 from zest_rl.report.sections import Caveats, Details, Episodes, Goals, LearningCurves, Ranking, Report, Results, Tasks
-from zest_rl.rewards.relabel import SCORER_FILE
+from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.training.checkpoints import snapshots
 

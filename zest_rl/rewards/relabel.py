@@ -20,7 +20,7 @@ from zest_rl.kitchen.views import Views
 from zest_rl.rewards.embeddings import EpisodeEmbeddings
 from zest_rl.rewards.frame_embeddings import FrameEmbeddings
 from zest_rl.rewards.goals import GoalSpec, read_free_goal, read_kitchen_goal
-from zest_rl.rewards.scorer import Scorer, ScorerConfig
+from zest_rl.rewards.scorer import SCORER_FILE, Scorer, ScorerConfig
 from zest_rl.rewards.scores import Features, Similarity
 from zest_rl.rewards.state_embeddings import EmbedConfig, StateEmbedder, StateEmbeddings
 from zest_rl.runtime import artifacts
@@ -29,7 +29,6 @@ from zest_rl.sources import KitchenStates, Source, open_source
 from zest_rl.types import FloatArray
 
 Reward = Literal["level", "difference"]
-SCORER_FILE = "zest_scorer.safetensors"
 GOAL_FOLDER = "zest_goal"
 MAX_THUMBNAILS, THUMBNAIL = 8, 160
 """Pictures per side of a goal that a report shows, and their largest side in pixels."""

@@ -34,6 +34,9 @@ from zest_rl.runtime.arrays import read_arrays, write_arrays
 from zest_rl.runtime.parallel import one_thread
 from zest_rl.types import FloatArray
 
+SCORER_FILE = "zest_scorer.safetensors"
+"""Name of a scorer's file in a dataset that it relabeled, and in the runs that were trained on it."""
+
 
 @dataclass(frozen=True)
 class ScorerConfig:

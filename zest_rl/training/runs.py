@@ -7,7 +7,7 @@ from typing import Any
 
 from zest_rl.agents import get_agent
 from zest_rl.data.reader import Dataset, open_dataset
-from zest_rl.rewards.relabel import SCORER_FILE
+from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.training.loop import OnProgress, TrainingConfig, fit
 
 

@@ -1,0 +1,129 @@
+"""Policy + environment (+ scorer for the online return-to-go) → what happened in N episodes, run in lockstep.
+
+The Decision Transformer's return-to-go falls by the *online ZeST score* of each new state, in the units of the rewards
+it was trained on. Ground-truth rewards are recorded, and shown to no policy but one that was trained on them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.agents import Policy
+from zest_rl.data.env_specs import check_env_spec, check_registered
+from zest_rl.data.provenance import DatasetRecord
+from zest_rl.errors import BadInput
+from zest_rl.kitchen.env import ENV_ID
+from zest_rl.rewards.state_scorer import StateScorer
+from zest_rl.types import FloatArray
+
+Rtg = Literal["online", "constant", "schedule"]
+"""How the return-to-go falls: by the online ZeST score, not at all, or as in the best training episode."""
+Arrays = dict[str, NDArray[Any]]
+
+
+def uses_online_scores(policy: Policy, rtg: Rtg) -> bool:
+    """Whether each new state has to be scored while the policy acts."""
+    return policy.uses_return and rtg == "online" and _record(policy).relabel is not None
+
+
+def run_episodes(
+    policy: Policy,
+    seeds: range,
+    *,
+    rtg: Rtg = "online",
+    target_return: float | None = None,
+    scorer: StateScorer | None = None,
+) -> Arrays:
+    """Run one episode per seed in the environment of the policy's dataset.
+
+    Args:
+        policy: acts on all episodes at once.
+        seeds: of the environments' resets.
+        rtg: how the return-to-go falls. With ``"online"``, that of a policy that was trained on ground-truth rewards
+            falls by those: the upper bound of the comparison.
+        target_return: what a policy that uses returns is asked for.
+        scorer: scores each new state; needed for ``rtg="online"`` with ZeST rewards.
+
+    Returns:
+        gt_reward (N, T+1) float32, gt_success (N, T+1) bool, qpos (N, T+1, nq), score (N, T+1) if scored, and what
+        `Policy.end` returns.
+
+    Raises:
+        BadInput: the environment is not the kitchen, or the policy needs scores and there is no scorer.
+    """
+    if scorer is None and uses_online_scores(policy, rtg):
+        raise BadInput(
+            "the policy was trained on ZeST scores, so rtg 'online' needs a scorer; give it, or use 'constant'"
+        )
+    dataset = _record(policy)
+    spec = _kitchen_spec(dataset.env_spec or "")
+    horizon = spec.max_episode_steps
+    assert horizon is not None
+    envs = [gymnasium.make(spec) for _ in seeds]
+    resets = [env.reset(seed=seed) for env, seed in zip(envs, seeds, strict=True)]
+    obs = np.stack([first for first, _ in resets])
+    trace = [_measure([info for _, info in resets])]
+    first_qpos = trace[0]["qpos"]
+    scores = [scorer.score_now(first_qpos, first_qpos)] if scorer is not None else []
+    try:
+        policy.begin(len(envs), target_return)
+        for step in range(horizon):
+            results = [env.step(action) for env, action in zip(envs, policy.act(obs), strict=True)]
+            obs = np.stack([result[0] for result in results])
+            rewards = np.array([result[1] for result in results], dtype=np.float32)
+            trace.append(_measure([result[4] for result in results]))
+            if scorer is not None:
+                scores.append(scorer.score_now(first_qpos, trace[-1]["qpos"]))
+                difference = dataset.relabel is not None and dataset.relabel.reward == "difference"
+                rewards = scores[-1] - scores[-2] if difference else scores[-1]
+            if policy.uses_return:
+                policy.observe(_decrement(policy, rtg, step, rewards))
+    finally:
+        further = policy.end()
+        for env in envs:
+            env.close()
+    arrays = {name: np.stack([moment[name] for moment in trace], axis=1) for name in trace[0]} | further
+    if scorer is not None:
+        arrays["score"] = np.stack(scores, axis=1)
+    return arrays
+
+
+def _record(policy: Policy) -> DatasetRecord:
+    return DatasetRecord.from_description(policy.meta["dataset"])
+
+
+def _kitchen_spec(env_spec: str) -> gymnasium.envs.registration.EnvSpec:
+    """Read the EnvSpec of a run; the run may come from somebody else, so it must not run code of its choice."""
+    check_env_spec(env_spec, "the environment of the run", "evaluate a run on a dataset of the kitchen")
+    spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
+    if spec.id != ENV_ID or spec.max_episode_steps is None:
+        raise BadInput(
+            f"evaluation needs {ENV_ID} with a horizon, got {spec.id} with max_episode_steps {spec.max_episode_steps}; "
+            "train on a dataset of `zest collect`"
+        )
+    check_registered(spec)
+    return spec
+
+
+def _measure(infos: Sequence[Mapping[str, Any]]) -> Arrays:
+    """Return ground truth and positions of one moment of N episodes."""
+    return {
+        "gt_reward": np.array([info["gt"]["reward"] for info in infos]),
+        "gt_success": np.array([info["gt"]["success"] for info in infos]),
+        "qpos": np.stack([info["state"]["qpos"] for info in infos]),
+    }
+
+
+def _decrement(policy: Policy, rtg: Rtg, step: int, rewards: FloatArray) -> FloatArray:
+    """By how much the return-to-go of each episode falls after `step`."""
+    if rtg == "constant":
+        return np.zeros_like(rewards)
+    if rtg == "schedule":
+        schedule = np.asarray(policy.meta["rtg_schedule"], dtype=np.float32)
+        return np.full_like(rewards, schedule[step] - schedule[step + 1] if step + 1 < len(schedule) else 0.0)
+    return rewards
