@@ -23,7 +23,7 @@ from zest_rl.kitchen import scene
 from zest_rl.kitchen.views import Views
 from zest_rl.metrics import reward_quality, statistics
 from zest_rl.metrics.statistics import Estimate
-from zest_rl.report import render_html
+from zest_rl.report.html import render_html
 from zest_rl.report.inspection_page import inspection_report
 from zest_rl.rewards.relabel import relabel_source
 from zest_rl.rewards.scorer import ScorerConfig
@@ -31,7 +31,7 @@ from zest_rl.sources.kitchen import kitchen_source
 
 VIEWS = Views("micro", n_views=1, size=96, tolerance=0.05)
 CONFIG = ScorerConfig("same-scene")
-NEED_TRUTH = {"spearman", "kendall", "pairwise_accuracy", "auprc", "successes", "epic"}
+NEED_TRUTH = {"spearman", "kendall", "pairwise", "auprc", "successes", "epic"}
 NEED_NO_TRUTH = {figure.key for figure in FIGURES} - NEED_TRUTH
 
 
@@ -51,7 +51,7 @@ def test_figures_are_those_of_the_recorded_scores_and_ground_truth(scored: str) 
     truth = np.array([episode.episode_return for episode in reader.read_ground_truth(scored)])
     assert set(found.figures) == {figure.key for figure in FIGURES}
     assert found.figures["spearman"] == statistics.spearman(returns, truth)
-    assert found.figures["pairwise_accuracy"] == reward_quality.pairwise_accuracy(returns, truth)
+    assert found.figures["pairwise"] == reward_quality.pairwise_accuracy(returns, truth)
     assert found.figures["contradictory"].value == 0
     assert found.task == "micro"
     scores, success = reader.read_scores(scored), [episode.success for episode in reader.read_ground_truth(scored)]

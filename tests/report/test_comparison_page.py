@@ -18,11 +18,11 @@ from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import EvaluationConfig, evaluate
 from zest_rl.kitchen.videos import Video
 from zest_rl.metrics import statistics
-from zest_rl.report import Caveats, Details, Episodes, Goals, LearningCurves, Results
 from zest_rl.report.comparison_page import compare, dataset_row, learning_curve, method_row, return_curve
 from zest_rl.report.episodes import paired_panels
 from zest_rl.report.goals import goal_panel, goal_scatter
 from zest_rl.report.methods import Method, latest_evaluation, methods_of_runs
+from zest_rl.report.sections import Caveats, Details, Episodes, Goals, LearningCurves, Results
 
 CONFIG = EvaluationConfig(n_episodes=2, seed=11, rtg="constant")
 

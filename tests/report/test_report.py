@@ -22,39 +22,40 @@ from hypothesis import strategies as st
 from markupsafe import escape
 
 from zest_rl.errors import BadInput
-from zest_rl.report import (
-    Caveats,
+from zest_rl.report.charts import axis_over
+from zest_rl.report.content import (
     Curve,
-    Details,
     EpisodePanel,
-    Episodes,
-    Frames,
     GoalPanel,
-    Goals,
-    LearningCurves,
     Matrix,
     MethodRow,
-    Pixels,
     QualityRow,
     QualityTable,
+    Scatter,
+    Strip,
+    TaskTable,
+)
+from zest_rl.report.html import render_html, write_report
+from zest_rl.report.sections import (
+    Caveats,
+    Details,
+    Episodes,
+    Frames,
+    Goals,
+    LearningCurves,
+    Pixels,
     Ranking,
     Report,
     Results,
     RewardQuality,
-    Scatter,
     ScoresOverTime,
     Section,
-    Strip,
     SubGoals,
     Tasks,
     TasksAgainstGoals,
-    TaskTable,
     Views,
     Warnings,
-    render_html,
-    write_report,
 )
-from zest_rl.report.charts import axis_over
 
 N_STEPS = 30
 FPS = 10.0

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.analysis.reward_figures import Rewards, measure, true_returns, warnings
+from zest_rl.analysis.reward_figures import measure, true_returns, warnings
 from zest_rl.data.provenance import RelabelRecord
 from zest_rl.data.reader import open_dataset
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.views import Views, canonical_states
+from zest_rl.metrics.reward_quality import returns_of
 from zest_rl.metrics.statistics import MIN_EPISODES_TO_RANK, Estimate
-from zest_rl.types import FloatArray
+from zest_rl.types import FloatArray, GroundTruth
 
 
 @dataclass(frozen=True)
@@ -70,12 +71,12 @@ def inspect(dataset_id: str) -> Inspection:
     frames, still = None, None
     after_actions = [episode[1:] for episode in scores]
     if views is not None and states is not None:
-        frames = [canonical_states(episode, views) for episode in states]
-        still = [(episode[1:] == episode[0]).all(axis=1) for episode in frames]
+        rendered = [canonical_states(episode, views) for episode in states]
+        frames = [episode[1:] for episode in rendered]
+        still = [(episode[1:] == episode[0]).all(axis=1) for episode in rendered]
     elif (made.scorer.features, made.scorer.similarity) == ("delta", "cos") and made.shuffle is None:
         still = [episode == 0 for episode in after_actions]  # nothing else scores exactly 0
-    known = Rewards(rewards, after_actions, frames, still, truth)
-    figures = measure(known)
+    figures = measure(rewards, after_actions, frames, still, truth)
     sentences = warnings(rewards, figures)
     if made.shuffle is not None:
         sentences.insert(0, "These are the scores of other episodes: the dataset was relabeled with --shuffle.")
@@ -85,21 +86,21 @@ def inspect(dataset_id: str) -> Inspection:
         made,
         figures,
         tuple(sentences),
-        _over_time(known),
-        known.returns,
+        _over_time(rewards, truth),
+        returns_of(rewards),
         None if truth is None else true_returns(truth),
         (float(min(map(np.min, scores))), float(max(map(np.max, scores)))),
         states,
     )
 
 
-def _over_time(known: Rewards) -> dict[str, FloatArray]:
-    groups = {"all episodes": known.rewards}
-    if known.truth is not None:
-        outcomes = [(episode.success, rewards) for episode, rewards in zip(known.truth, known.rewards, strict=True)]
+def _over_time(rewards: list[FloatArray], truth: list[GroundTruth] | None) -> dict[str, FloatArray]:
+    groups = {"all episodes": rewards}
+    if truth is not None:
+        outcomes = list(zip(truth, rewards, strict=True))
         groups = {
-            "successes": [rewards for success, rewards in outcomes if success],
-            "failures": [rewards for success, rewards in outcomes if not success],
+            "successes": [of_episode for episode, of_episode in outcomes if episode.success],
+            "failures": [of_episode for episode, of_episode in outcomes if not episode.success],
         }
     return {name: _mean_by_step(group) for name, group in groups.items() if group}
 

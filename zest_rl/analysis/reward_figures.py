@@ -1,10 +1,9 @@
-"""The figures that judge the rewards of a dataset, and the sentences that warn of them. Ground truth judges alone."""
+"""The figures that judge the rewards of a dataset, and sentences that warn of bad ones. Ground truth only judges."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,136 +19,96 @@ FLAT = 1e-5
 
 
 @dataclass(frozen=True)
-class Rewards:
-    """What is known of the rewards of one dataset."""
-
-    rewards: list[FloatArray]
-    """(T,) per episode, as a trainer sees them."""
-    scores: list[FloatArray]
-    """(T,) per episode, of the frames after each action; the rewards, unless these are differences."""
-    states: list[NDArray[np.float64]] | None
-    """(T+1, nq) per episode, rounded as the frames were rendered; None of other robots than the kitchen's."""
-    still: list[NDArray[np.bool_]] | None
-    """(T,) per episode, frames that show what the first one shows; None where that is not known."""
-    truth: list[GroundTruth] | None
-
-    @cached_property
-    def returns(self) -> NDArray[np.float64]:
-        """(N,) float64."""
-        return reward_quality.returns_of(self.rewards)
-
-
-Truth = list[GroundTruth]
-Measure = Callable[[Rewards], Estimate | None]
-
-
-@dataclass(frozen=True)
 class Figure:
-    """One number that judges a reward."""
+    """One number that judges a reward; `measure` measures it."""
 
     key: str
     label: str
     """What people and `zest inspect --json` call it."""
     meaning: str
-    measure: Measure
-    """None where what it needs is not known."""
-
-
-def true_returns(truth: Truth) -> NDArray[np.float64]:
-    """(N,) float64."""
-    return np.array([episode.episode_return for episode in truth])
-
-
-def _with_truth(measure: Callable[[Rewards, Truth], Estimate]) -> Measure:
-    return lambda known: None if known.truth is None else measure(known, known.truth)
 
 
 FIGURES = (
-    Figure(
-        "spearman",
-        "Spearman ρ",
-        "rank correlation of the episodes' returns with the true ones; 1 is best",
-        _with_truth(lambda known, truth: statistics.spearman(known.returns, true_returns(truth))),
-    ),
-    Figure(
-        "kendall",
-        "Kendall τ-b",
-        "the same by pairs; 1 is best",
-        _with_truth(lambda known, truth: reward_quality.kendall(known.returns, true_returns(truth))),
-    ),
-    Figure(
-        "pairwise_accuracy",
-        "Pairwise accuracy",
-        "share of pairs of episodes that are ordered rightly; .5 is chance",
-        _with_truth(lambda known, truth: reward_quality.pairwise_accuracy(known.returns, true_returns(truth))),
-    ),
+    Figure("spearman", "Spearman ρ", "rank correlation of the episodes' returns with the true ones; 1 is best"),
+    Figure("kendall", "Kendall τ-b", "the same by pairs; 1 is best"),
+    Figure("pairwise", "Pairwise accuracy", "share of pairs of episodes that are ordered rightly; .5 is chance"),
     Figure(
         "auprc",
         "AUPRC of success",
         "how well the return tells successes; chance is their share, which is the next line",
-        _with_truth(
-            lambda known, truth: reward_quality.average_precision(known.returns, np.array([e.success for e in truth]))
-        ),
     ),
-    Figure(
-        "successes",
-        "Share of successes",
-        "in the dataset",
-        _with_truth(lambda known, truth: statistics.wilson(sum(e.success for e in truth), len(truth))),
-    ),
+    Figure("successes", "Share of successes", "in the dataset"),
     Figure(
         "epic",
         "EPIC distance",
         "of levels to the true reward, step by step; 0 is the same up to scale and offset, .71 unrelated",
-        _with_truth(lambda known, truth: reward_quality.epic_distance(known.scores, [e.rewards for e in truth])),
     ),
-    Figure(
-        "value_order",
-        "Value-order correlation",
-        "of reward and time within an episode; 1 rises at every step",
-        lambda known: reward_quality.value_order(known.rewards),
-    ),
+    Figure("value_order", "Value-order correlation", "of reward and time within an episode; 1 rises at every step"),
     Figure(
         "told_by_step",
         "Told by the step",
         "share of the rewards' variance that the number of the step tells; 1 is a clock",
-        lambda known: reward_quality.share_told_by_step(known.rewards),
     ),
     Figure(
         "straight_in_time",
         "Straight in time",
         "share of the score's variance within an episode that a straight line in time tells; 1 is proportional to time",
-        lambda known: reward_quality.straight_in_time(known.scores),
     ),
-    Figure(
-        "saturated",
-        "Saturated",
-        "share of rewards next to the lowest or the highest",
-        lambda known: reward_quality.share_saturated(known.rewards),
-    ),
-    Figure(
-        "still",
-        "Nothing to see",
-        "share of frames that show what the first one shows",
-        lambda known: None if known.still is None else reward_quality.share_still(known.still),
-    ),
+    Figure("saturated", "Saturated", "share of rewards next to the lowest or the highest"),
+    Figure("still", "Nothing to see", "share of frames that show what the first one shows"),
     Figure(
         "contradictory",
         "Contradictory",
         "share of frames that score otherwise than an equal one of the same episode; 0 is right",
-        lambda known: (
-            None
-            if known.states is None
-            else reward_quality.share_contradictory(known.scores, [episode[1:] for episode in known.states])
-        ),
     ),
 )
+"""In the order in which they are shown."""
 
 
-def measure(known: Rewards) -> dict[str, Estimate]:
-    """Return the figures by their keys; those that need what is not known are missing."""
-    measured = {figure.key: figure.measure(known) for figure in FIGURES}
-    return {key: estimate for key, estimate in measured.items() if estimate is not None}
+def true_returns(truth: Sequence[GroundTruth]) -> NDArray[np.float64]:
+    """(N,) float64 ground-truth returns."""
+    return np.array([episode.episode_return for episode in truth])
+
+
+def measure(
+    rewards: list[FloatArray],
+    scores: list[FloatArray],
+    frames: list[NDArray[np.float64]] | None,
+    still: list[NDArray[np.bool_]] | None,
+    truth: list[GroundTruth] | None,
+) -> dict[str, Estimate]:
+    """Return the figures by the keys of `FIGURES`; those that need what is not known are missing.
+
+    Args:
+        rewards: (T,) per episode, as a trainer sees them.
+        scores: (T,) per episode, of the frames after each action; the rewards, unless these are differences.
+        frames: (T, nq) states per episode after each action, rounded as they were rendered; None of other robots than
+            the kitchen's.
+        still: (T,) per episode, frames that show what the first one shows; None where that is not known.
+        truth: ground truth per episode, None where there is none.
+    """
+    figures = {
+        "value_order": reward_quality.value_order(rewards),
+        "told_by_step": reward_quality.share_told_by_step(rewards),
+        "straight_in_time": reward_quality.straight_in_time(scores),
+        "saturated": reward_quality.share_saturated(rewards),
+    }
+    if still is not None:
+        figures["still"] = reward_quality.share_still(still)
+    if frames is not None:
+        figures["contradictory"] = reward_quality.share_contradictory(scores, frames)
+    if truth is not None:
+        returns, wanted = reward_quality.returns_of(rewards), true_returns(truth)
+        success = np.array([episode.success for episode in truth])
+        figures |= {
+            "spearman": statistics.spearman(returns, wanted),
+            "kendall": reward_quality.kendall(returns, wanted),
+            "pairwise": reward_quality.pairwise_accuracy(returns, wanted),
+            "auprc": reward_quality.average_precision(returns, success),
+            "successes": statistics.wilson(int(success.sum()), len(success)),
+            "epic": reward_quality.epic_distance(scores, [episode.rewards for episode in truth]),
+        }
+    return figures
 
 
 def warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimate]) -> list[str]:

@@ -80,7 +80,7 @@ CONFIGS: dict[str, type[Any]] = {config.what: config for config in (KitchenArgum
 def run(config: KitchenArguments | VideoArguments, ui: Ui) -> dict[str, Any]:
     """Score the episode by each sub-goal and write the page."""
     from zest_rl.analysis.sub_goals import rise_in_order
-    from zest_rl.report import write_report
+    from zest_rl.report.html import write_report
     from zest_rl.report.sub_goal_page import sub_goal_report
     from zest_rl.runtime import artifacts
 

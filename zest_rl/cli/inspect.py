@@ -29,7 +29,7 @@ class Config:
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Measure, warn, write the page."""
     from zest_rl.analysis.cross_task import inspect_datasets
-    from zest_rl.report import write_report
+    from zest_rl.report.html import write_report
     from zest_rl.report.inspection_page import inspection_report
 
     with progress_in_parts(ui, "inspecting") as on_progress:

@@ -25,8 +25,9 @@ class Config:
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Group the runs by method, build the report, write it."""
-    from zest_rl.report import Results, write_report
     from zest_rl.report.comparison_page import compare_runs
+    from zest_rl.report.html import write_report
+    from zest_rl.report.sections import Results
 
     report = compare_runs(config.runs, title=config.title)
     path = write_report(report, config.output)

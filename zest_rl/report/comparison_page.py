@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -183,7 +182,7 @@ def compare(
         BadInput: a run was not evaluated, or is of another task than the others.
     """
     metas = {str(run): read_meta(run) for method in methods for run in method.runs}
-    tasks = {json.loads(meta["dataset"]["env_spec"])["kwargs"]["task"] for meta in metas.values()}
+    tasks = {DatasetRecord.from_description(meta["dataset"]).env["kwargs"]["task"] for meta in metas.values()}
     if len(tasks) != 1:
         raise BadInput(f"a report compares runs of one task, got {', '.join(sorted(tasks))}; write one report per task")
     evaluations = {method.name: method.evaluations() for method in methods}
@@ -239,7 +238,7 @@ def overview(
 
     Args:
         title: headline.
-        methods: task → rows; the same names for every task.
+        methods: task → rows; the same methods, in the same order, for every task.
         reports: task → its own report.
         pages: task → file name of that report, beside this one.
         sources: the collected datasets.
@@ -247,8 +246,8 @@ def overview(
         caveats: sentences shown at the end.
         details: shown as collapsed JSON.
     """
-    by_name = {name: [m for of_task in methods.values() for m in of_task if m.name == name] for name in _names(methods)}
-    rows = [method_row(group[0], *(method.evaluations() for method in group)) for group in by_name.values()]
+    by_name = zip(*methods.values(), strict=True)
+    rows = [method_row(group[0], *(method.evaluations() for method in group)) for group in by_name]
     rows.insert(0, dataset_row(*sources, paper=paper_demo))
     scatters = [(task, scatter) for task, report in reports.items() for scatter in report.items(Ranking)]
     curves = [(task, curve) for task, report in reports.items() for curve in report.items(LearningCurves)]
@@ -268,10 +267,6 @@ def overview(
 
 def _agent(metas: Mapping[str, dict[str, Any]], method: Method) -> str:
     return str(metas[str(method.runs[0])]["agent"])
-
-
-def _names(methods: Mapping[str, Sequence[Method]]) -> list[str]:
-    return [method.name for method in next(iter(methods.values()))]
 
 
 def _best_sentence(rows: Sequence[MethodRow], where: str = "") -> str:

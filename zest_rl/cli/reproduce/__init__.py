@@ -32,8 +32,9 @@ from zest_rl.cli.ui import SilentUi, Ui
 
 if TYPE_CHECKING:
     from zest_rl.kitchen.videos import Video
-    from zest_rl.report import MethodRow, Report
+    from zest_rl.report.content import MethodRow
     from zest_rl.report.methods import Method
+    from zest_rl.report.sections import Report
 
 POLL_SECONDS = 2.0
 
@@ -66,8 +67,8 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
 def _run(config: Config, ui: Ui) -> dict[str, Any]:
     from zest_rl.kitchen.videos import ensure_videos, missing
-    from zest_rl.report import write_report
     from zest_rl.report.comparison_page import overview
+    from zest_rl.report.html import write_report
     from zest_rl.runtime import artifacts
 
     output = config.output or Path("runs") / config.file.stem
@@ -154,7 +155,7 @@ def _result(
     output: Path,
 ) -> dict[str, Any]:
     """What is written to result.json."""
-    from zest_rl.report import Ranking, Results
+    from zest_rl.report.sections import Ranking, Results
     from zest_rl.runtime import artifacts
 
     return {

@@ -124,7 +124,7 @@ def read_study(path: Path) -> StudyPlan:
 def run(path: Path, output: Path, ui: Ui, *, n_workers: int | None = None) -> dict[str, Any]:
     """Collect what is not there, select in every cell, and write result.json, table.md and report.html."""
     from zest_rl.cli import collect
-    from zest_rl.report import write_report
+    from zest_rl.report.html import write_report
     from zest_rl.runtime import artifacts
 
     plan = read_study(path)
@@ -252,7 +252,8 @@ def markdown(result: Mapping[str, Any]) -> str:
 
 def study_report(result: Mapping[str, Any], caveats: tuple[str, ...]) -> Any:
     """Build the page: the same tables, with intervals."""
-    from zest_rl.report import Caveats, Details, QualityRow, QualityTable, Report, RewardQuality
+    from zest_rl.report.content import QualityRow, QualityTable
+    from zest_rl.report.sections import Caveats, Details, Report, RewardQuality
 
     tasks = _tasks(result)
     intervals = {
