@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from conftest import COLLECTED
 from PIL import Image
+from read_dataset import read
 
 from zest_rl.cli import collect as collect_verb
 from zest_rl.cli import follow, select, train
@@ -17,6 +18,7 @@ from zest_rl.cli.config import parse_config
 from zest_rl.cli.reproduce.plan import read_plan
 from zest_rl.cli.reproduce.study import read_study
 from zest_rl.data import reader
+from zest_rl.data.reader import Dataset
 from zest_rl.runtime import artifacts
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -98,7 +100,7 @@ def test_a_policy_on_the_kitchen_relabeled_by_other_frames_is_evaluated_but_not_
     for part, colour in (("init", "black"), ("goal", "white")):
         (tmp_path / part).mkdir()
         Image.new("RGB", (16, 16), colour).save(tmp_path / part / "0.png")
-    for i, episode in enumerate(reader.read_episodes(collected)):
+    for i, episode in enumerate(read(collected, Dataset.episodes)):
         (tmp_path / "films" / f"episode_{i}").mkdir(parents=True)
         for t in range(len(episode) + 1):
             Image.new("L", (8, 8), t).save(tmp_path / "films" / f"episode_{i}" / f"{t}.png")

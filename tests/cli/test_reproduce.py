@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from read_dataset import read
 
 from zest_rl import cli
 from zest_rl.cli import reproduce
@@ -396,7 +397,7 @@ def test_a_recipe_without_methods_ends_with_what_its_rewards_are_worth(
     without_methods = RECIPE[: RECIPE.index("[train]")]
     result = zest("reproduce", write(tmp_path, without_methods), "--output", tmp_path / "out", "--n-workers", "1")
     (dataset,) = result["datasets"]
-    assert reader.read_metadata(dataset)["zest"]["relabel"]["source"] == "zest/kitchen-micro-whole-v0"
+    assert read(dataset, lambda ds: ds.metadata)["zest"]["relabel"]["source"] == "zest/kitchen-micro-whole-v0"
     assert "Spearman ρ" in next(iter(result["datasets"].values()))["figures"]
     assert json.loads((tmp_path / "out" / "result.json").read_text())["datasets"] == result["datasets"]
     assert "Views" in (tmp_path / "out" / "report.html").read_text()

@@ -5,6 +5,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +14,24 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from read_dataset import read
 
 from zest_rl.data import reader
+from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.sources import open_source
 
 READERS: dict[str, Callable[[str], Any]] = {
-    "read_metadata": reader.read_metadata,
-    "read_episodes": reader.read_episodes,
-    "read_states": reader.read_states,
-    "read_ground_truth": reader.read_ground_truth,
-    "read_scores": reader.read_scores,
-    "fingerprint": reader.fingerprint,
-    "describe": reader.describe,
-    "task_name": reader.task_name,
+    what.__name__: partial(read, what=what)
+    for what in (
+        Dataset.episodes,
+        Dataset.states,
+        Dataset.truth,
+        Dataset.scores,
+        Dataset.fingerprint,
+        Dataset.describe,
+        Dataset.kitchen_task,
+    )
 }
 
 
@@ -65,9 +70,9 @@ def test_a_malformed_id_is_refused_before_anything_is_made(
     dataset_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    for read in (reader.dataset_path, reader.exists, *READERS.values()):
+    for refuse in (reader.dataset_path, reader.exists, *READERS.values()):
         with pytest.raises(BadInput, match="a dataset id must look like 'namespace/name-v0'"):
-            read(dataset_id)
+            refuse(dataset_id)
     assert not list(tmp_path.iterdir())
 
 
@@ -97,16 +102,16 @@ def test_the_root_is_where_minari_looks(tmp_path: Path, monkeypatch: pytest.Monk
     assert reader.datasets_root() == Path.home() / ".minari/datasets"
 
 
-@pytest.mark.parametrize("read", READERS.values(), ids=READERS)
-def test_a_missing_dataset_names_the_nearest(read: Callable[[str], Any], collected: str) -> None:
+@pytest.mark.parametrize("read_by_id", READERS.values(), ids=READERS)
+def test_a_missing_dataset_names_the_nearest(read_by_id: Callable[[str], Any], collected: str) -> None:
     with pytest.raises(BadInput, match=rf"no dataset 'zest/kitchen-mirco-tiny-v0' .*did you mean '{collected}'\?"):
-        read("zest/kitchen-mirco-tiny-v0")
+        read_by_id("zest/kitchen-mirco-tiny-v0")
 
 
 def test_without_any_dataset_the_message_says_how_to_make_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     with pytest.raises(BadInput, match=r"valid: \(none\)\. Make one with `zest collect`"):
-        reader.read_episodes("zest/x-v0")
+        read("zest/x-v0", Dataset.episodes)
     assert reader.list_datasets() == []
 
 
@@ -123,9 +128,9 @@ def test_complete_datasets_are_listed_and_staged_ones_are_not(collected: str) ->
 
 def test_what_is_read_fits_together(collected: str) -> None:
     episodes, states, truths = (
-        reader.read_episodes(collected),
-        reader.read_states(collected),
-        reader.read_ground_truth(collected),
+        read(collected, Dataset.episodes),
+        read(collected, Dataset.states),
+        read(collected, Dataset.truth),
     )
     assert [len(episode) for episode in episodes] == [100] * 4
     for episode, qpos, truth in zip(episodes, states, truths, strict=True):
@@ -143,7 +148,7 @@ def test_episodes_are_read_in_the_order_of_their_numbers(collected: str) -> None
     with edited(collected) as file:
         for i in range(4, 11):
             file.copy(f"episode_{i % 4}", f"episode_{i}")
-    found = reader.read_episodes(collected)
+    found = read(collected, Dataset.episodes)
     assert len(found) == 11
     for i, episode in enumerate(found):
         np.testing.assert_array_equal(episode.actions, found[i % 4].actions)
@@ -154,29 +159,29 @@ def test_a_gap_in_their_numbers_is_refused_for_minari_could_not_read_it(collecte
     with edited(collected) as file:
         file.move("episode_1", "episode_10")
     with pytest.raises(BadInput, match="must hold episode_0, … episode_3, as Minari needs it, but episode_1 is"):
-        reader.read_episodes(collected)
+        read(collected, Dataset.episodes)
 
 
 def test_only_the_ground_truth_reader_opens_the_ground_truth(collected: str) -> None:
-    before = reader.read_episodes(collected), reader.read_states(collected), reader.fingerprint(collected)
+    before = read(collected, Dataset.episodes), read(collected, Dataset.states), read(collected, Dataset.fingerprint)
     with edited(collected) as file:
         for episode in file.values():
             del episode["infos/gt"]
-    np.testing.assert_array_equal(reader.read_episodes(collected)[0].obs, before[0][0].obs)
-    np.testing.assert_array_equal(reader.read_states(collected)[0], before[1][0])
-    assert reader.fingerprint(collected) == before[2]
+    np.testing.assert_array_equal(read(collected, Dataset.episodes)[0].obs, before[0][0].obs)
+    np.testing.assert_array_equal(read(collected, Dataset.states)[0], before[1][0])
+    assert read(collected, Dataset.fingerprint) == before[2]
     with pytest.raises(BadInput, match="no 'infos/gt/reward' in /episode_0; record it when the dataset is made"):
-        reader.read_ground_truth(collected)
+        read(collected, Dataset.truth)
 
 
 def test_the_first_ground_truth_reward_belongs_to_the_reset_and_to_no_action(collected: str) -> None:
     replace_array(collected, "episode_0/infos/gt/reward", lambda reward: np.arange(101, dtype=np.float32))
-    np.testing.assert_array_equal(reader.read_ground_truth(collected)[0].rewards, np.arange(1, 101))
+    np.testing.assert_array_equal(read(collected, Dataset.truth)[0].rewards, np.arange(1, 101))
 
 
 def test_a_dataset_that_was_not_relabeled_has_no_scores(collected: str) -> None:
     with pytest.raises(BadInput, match=rf"episode_0 of dataset {collected}: .*no 'infos/zest/score'"):
-        reader.read_scores(collected)
+        read(collected, Dataset.scores)
 
 
 # --- datasets that break a rule ---------------------------------------------------------------------------------------
@@ -199,7 +204,7 @@ def test_a_broken_episode_is_named_with_its_dataset(
 ) -> None:
     replace_array(collected, f"episode_2/{name}", change)
     with pytest.raises(BadInput, match=rf"episode_2 of dataset {collected}: {rule}"):
-        reader.read_episodes(collected)
+        read(collected, Dataset.episodes)
 
 
 @pytest.mark.parametrize(
@@ -215,13 +220,13 @@ def test_a_broken_recorded_state_is_named(
 ) -> None:
     replace_array(collected, "episode_1/infos/state/qpos", change)
     with pytest.raises(BadInput, match=rf"episode_1 of dataset {collected}: infos/state/{rule}"):
-        reader.read_states(collected)
+        read(collected, Dataset.states)
 
 
 def test_an_episode_without_steps_has_no_states(collected: str) -> None:
     replace_array(collected, "episode_1/rewards", lambda rewards: rewards[:0])
     with pytest.raises(BadInput, match=rf"episode_1 of dataset {collected}: .*at least 1 step"):
-        reader.read_states(collected)
+        read(collected, Dataset.states)
 
 
 @pytest.mark.parametrize("name", ["observations", "actions", "rewards", "terminations"])
@@ -229,7 +234,7 @@ def test_a_missing_array_is_named(collected: str, name: str) -> None:
     with edited(collected) as file:
         del file[f"episode_0/{name}"]
     with pytest.raises(BadInput, match=rf"no '{name}' in /episode_0"):
-        reader.read_episodes(collected)
+        read(collected, Dataset.episodes)
 
 
 def test_a_dictionary_of_pictures_alone_is_refused(collected: str) -> None:
@@ -237,14 +242,14 @@ def test_a_dictionary_of_pictures_alone_is_refused(collected: str) -> None:
         del file["episode_0/observations"]
         file["episode_0/observations/camera"] = np.zeros((101, 8, 8, 3), np.uint8)
     with pytest.raises(BadInput, match=r"/episode_0/observations holds pictures only; a policy here needs numbers"):
-        reader.read_episodes(collected)
+        read(collected, Dataset.episodes)
 
 
 def test_a_dataset_without_episodes_is_refused(collected: str) -> None:
     with edited(collected) as file:
         file.clear()
     with pytest.raises(BadInput, match="has no episodes; collect it again"):
-        reader.read_episodes(collected)
+        read(collected, Dataset.episodes)
 
 
 # --- damage and code --------------------------------------------------------------------------------------------------
@@ -256,18 +261,18 @@ def test_one_flipped_bit_is_noticed(collected: str, name: str) -> None:
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
-    for read in (reader.read_metadata, reader.read_episodes, reader.fingerprint):
+    for read_by_id in READERS.values():
         with pytest.raises(
             ZestError, match=rf"{name} of dataset {collected} is missing or was changed since"
         ) as caught:
-            read(collected)
+            read_by_id(collected)
         assert not isinstance(caught.value, BadInput)
 
 
 def test_a_missing_data_file_is_noticed(collected: str) -> None:
     (reader.dataset_path(collected) / reader.DATA_FILE).unlink()
     with pytest.raises(ZestError, match=r"main_data\.hdf5 .* is missing"):
-        reader.read_episodes(collected)
+        read(collected, Dataset.episodes)
 
 
 def test_a_truncated_file_of_another_program_is_a_clear_error(collected: str) -> None:
@@ -276,7 +281,7 @@ def test_a_truncated_file_of_another_program_is_a_clear_error(collected: str) ->
     content = (folder / reader.DATA_FILE).read_bytes()
     (folder / reader.DATA_FILE).write_bytes(content[: len(content) // 2])
     with pytest.raises(BadInput, match=rf"dataset {collected} cannot be read as HDF5"):
-        reader.read_episodes(collected)
+        read(collected, Dataset.episodes)
 
 
 def test_a_damaged_block_of_a_compressed_file_is_a_clear_error(collected: str) -> None:
@@ -290,7 +295,7 @@ def test_a_damaged_block_of_a_compressed_file_is_a_clear_error(collected: str) -
     content[block.byte_offset : block.byte_offset + block.size] = bytes(block.size)
     path.write_bytes(content)
     with pytest.raises(ZestError, match=rf"episode_1 of dataset {collected} is damaged .*make it again"):
-        reader.read_episodes(collected)
+        read(collected, Dataset.episodes)
 
 
 @pytest.fixture
@@ -308,13 +313,13 @@ def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 def test_a_dataset_of_foreign_code_is_read_without_running_it_and_no_environment_is_built_from_it(
     collected: str, trap: str, tmp_path: Path, key: str, hidden_in_wrapper: bool
 ) -> None:
-    spec = json.loads(reader.read_metadata(collected)["env_spec"])
+    spec = json.loads(read(collected, lambda ds: ds.metadata)["env_spec"])
     if hidden_in_wrapper:
         spec["additional_wrappers"] = [{"name": "Trap", "entry_point": trap, "kwargs": {}}]
     else:
         spec["entry_point"] = trap
     change_metadata(collected, **{key: json.dumps(spec)})
-    for name in READERS.keys() - {"read_scores", "task_name"}:  # they need other datasets than this
+    for name in READERS.keys() - {"scores", "kitchen_task"}:  # they need other datasets than this
         READERS[name](collected)
     if key == "env_spec":
         with pytest.raises(BadInput, match=rf"the {key} of dataset {collected} would run code of '{trap}'; only"):
@@ -326,7 +331,7 @@ def test_a_dataset_of_foreign_code_is_read_without_running_it_and_no_environment
 def test_the_trap_does_spring_when_nobody_checks(collected: str, trap: str, tmp_path: Path) -> None:
     import gymnasium
 
-    spec = gymnasium.envs.registration.EnvSpec.from_json(reader.read_metadata(collected)["env_spec"])
+    spec = gymnasium.envs.registration.EnvSpec.from_json(read(collected, lambda ds: ds.metadata)["env_spec"])
     wrapper = gymnasium.envs.registration.WrapperSpec("Trap", trap, {})
     spec.additional_wrappers = (wrapper,)
     with pytest.raises((TypeError, AttributeError)):
@@ -338,33 +343,33 @@ def test_the_trap_does_spring_when_nobody_checks(collected: str, trap: str, tmp_
 def test_a_malformed_env_spec_is_refused(collected: str, spec: str) -> None:
     change_metadata(collected, env_spec=spec)
     with pytest.raises(BadInput, match=rf"the env_spec of dataset {collected} is not the JSON of a Gymnasium EnvSpec"):
-        reader.read_metadata(collected)
+        read(collected, lambda ds: ds.metadata)
 
 
 # --- identity ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_fingerprint_sees_inputs_and_states_but_no_rewards(collected: str) -> None:
-    before = reader.fingerprint(collected)
+    before = read(collected, Dataset.fingerprint)
     replace_array(collected, "episode_0/rewards", lambda rewards: rewards + 1)
-    assert reader.fingerprint(collected) == before
+    assert read(collected, Dataset.fingerprint) == before
     seen = {before}
     for name in ("observations", "actions", "infos/state/qpos", "terminations"):
         replace_array(collected, f"episode_3/{name}", lambda array: ~array if array.dtype == bool else array + 1e-3)
-        seen.add(reader.fingerprint(collected))
+        seen.add(read(collected, Dataset.fingerprint))
     assert len(seen) == 5
 
 
 def test_a_description_sees_rewards_and_leaves_out_who_made_it_where(collected: str) -> None:
     collect = {"asked": {"task": "micro"}, "provenance": {"command": "zest collect"}}
     change_metadata(collected, zest={"collect": collect})
-    before = reader.describe(collected)
+    before = read(collected, Dataset.describe)
     assert before["id"] == collected
     assert before["zest"] == {"collect": {"asked": {"task": "micro"}}}
     assert (before["ref_min_score"], before["ref_max_score"]) == (0.0, 70.0)
     assert json.loads(json.dumps(before)) == before
     replace_array(collected, "episode_0/rewards", lambda rewards: rewards + 1)
-    after = reader.describe(collected)
+    after = read(collected, Dataset.describe)
     assert after["rewards_sha256"] != before["rewards_sha256"]
     assert {**after, "rewards_sha256": None} == {**before, "rewards_sha256": None}
 
@@ -373,15 +378,15 @@ def test_a_description_sees_rewards_and_leaves_out_who_made_it_where(collected: 
 def test_a_dataset_that_no_policy_could_be_evaluated_on_cannot_be_described(collected: str, key: str) -> None:
     change_metadata(collected, **{key: None})
     with pytest.raises(BadInput, match=f"has no {key} in its metadata"):
-        reader.describe(collected)
+        read(collected, Dataset.describe)
 
 
 def test_the_task_is_that_of_the_environment(collected: str) -> None:
-    assert reader.task_name(collected) == "micro"
+    assert read(collected, Dataset.kitchen_task) == "micro"
 
 
 @pytest.mark.parametrize("spec", [None, {"id": "Pendulum-v1", "entry_point": "gymnasium.envs.x:Y", "kwargs": {}}])
 def test_a_dataset_of_another_environment_has_no_task(collected: str, spec: dict[str, Any] | None) -> None:
     change_metadata(collected, env_spec=spec and json.dumps(spec))
     with pytest.raises(BadInput, match="frames can be rendered for zest/Kitchen-v1 only"):
-        reader.task_name(collected)
+        read(collected, Dataset.kitchen_task)

@@ -14,8 +14,10 @@ import h5py
 import minari
 import numpy as np
 import pytest
+from read_dataset import read
 
 from zest_rl.data import reader
+from zest_rl.data.reader import Dataset
 from zest_rl.data.writer import DatasetCopy, Recording, write_dataset, write_scored
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen import collect
@@ -74,7 +76,7 @@ def copy_of(dataset_id: str) -> DatasetCopy:
 
 def new_rewards(source: str) -> tuple[list[np.ndarray], list[np.ndarray]]:
     rng = np.random.default_rng(0)
-    scores = [rng.normal(size=len(episode) + 1).astype(np.float32) for episode in reader.read_episodes(source)]
+    scores = [rng.normal(size=len(episode) + 1).astype(np.float32) for episode in read(source, Dataset.episodes)]
     return [score[1:] for score in scores], scores
 
 
@@ -119,7 +121,7 @@ def test_minari_and_this_package_read_back_what_was_written(root: Path) -> None:
     assert write(recordings) == root / NEW
     dataset = minari.load_dataset(NEW)
     assert (dataset.total_episodes, dataset.total_steps) == (3, 300)
-    ours = zip(reader.read_episodes(NEW), reader.read_states(NEW), reader.read_ground_truth(NEW), strict=True)
+    ours = zip(read(NEW, Dataset.episodes), read(NEW, Dataset.states), read(NEW, Dataset.truth), strict=True)
     for recording, theirs, (episode, qpos, truth) in zip(recordings, dataset.iterate_episodes(), ours, strict=True):
         np.testing.assert_array_equal(theirs.observations, recording.obs)
         np.testing.assert_array_equal(theirs.actions, recording.actions)
@@ -136,7 +138,7 @@ def test_minari_and_this_package_read_back_what_was_written(root: Path) -> None:
         np.testing.assert_array_equal(truth.rewards, recording.gt_reward[1:])
         assert episode.terminated == recording.terminated
         assert truth.success
-    metadata = reader.read_metadata(NEW)
+    metadata = read(NEW, lambda ds: ds.metadata)
     assert metadata["zest"] == {"collect": {"asked": {"n": 3}}}
     assert (metadata["ref_min_score"], metadata["ref_max_score"]) == (0.5, 70.0)
     assert listed() == {NEW}
@@ -221,13 +223,13 @@ def test_relabeling_changes_rewards_adds_scores_and_keeps_everything_else_bit_fo
         del before[f"episode_{i}/rewards"]
     assert after == before
     assert artifacts.read_json(path / "scores.json") == [1]
-    old, new = reader.read_metadata(collected), reader.read_metadata(NEW)
+    old, new = read(collected, lambda ds: ds.metadata), read(NEW, lambda ds: ds.metadata)
     assert new.pop("dataset_id") == NEW
     assert new.pop("description") == "a few episodes for tests And more."
     assert new.pop("zest") == {**old.pop("zest"), "relabel": {"a": 1}}
     assert new == {key: value for key, value in old.items() if key in new}
     assert old.keys() - new.keys() == {"dataset_id", "description"}
-    assert reader.fingerprint(NEW) == reader.fingerprint(collected)
+    assert read(NEW, Dataset.fingerprint) == read(collected, Dataset.fingerprint)
 
 
 def test_minari_and_this_package_read_the_relabeled_rewards(collected: str) -> None:
@@ -238,8 +240,8 @@ def test_minari_and_this_package_read_the_relabeled_rewards(collected: str) -> N
     for i, episode in enumerate(dataset.iterate_episodes()):
         np.testing.assert_array_equal(episode.rewards, rewards[i])
         np.testing.assert_array_equal(episode.infos["zest"]["score"], scores[i])
-        np.testing.assert_array_equal(reader.read_scores(NEW)[i], scores[i])
-        np.testing.assert_array_equal(reader.read_episodes(NEW)[i].rewards, rewards[i])
+        np.testing.assert_array_equal(read(NEW, Dataset.scores)[i], scores[i])
+        np.testing.assert_array_equal(read(NEW, Dataset.episodes)[i].rewards, rewards[i])
     assert listed() == {collected, NEW}
 
 
@@ -255,8 +257,8 @@ def test_relabeling_a_relabeled_dataset_replaces_its_scores(collected: str) -> N
         zest={"relabel": {"a": 2}},
         extra=lambda staging: None,
     )
-    np.testing.assert_array_equal(reader.read_scores("zest/again-v0"), zeros)
-    assert reader.read_metadata("zest/again-v0")["zest"]["relabel"] == {"a": 2}
+    np.testing.assert_array_equal(read("zest/again-v0", Dataset.scores), zeros)
+    assert read("zest/again-v0", lambda ds: ds.metadata)["zest"]["relabel"] == {"a": 2}
 
 
 @pytest.mark.parametrize(
@@ -351,6 +353,8 @@ def test_a_read_only_root_is_refused(small_root: Disk) -> None:
 
 # --- cuts and competitors ---------------------------------------------------------------------------------------------
 
+PYTHONPATH = os.pathsep.join(map(str, list(Path(__file__).parents)[:3]))
+"""Where a script finds this module, what tests share, and the package."""
 WRITE = f"""
 import sys
 from test_writer import random_recordings, write
@@ -365,7 +369,7 @@ print("written {NEW}")
 def start_writing(n_episodes: int, seed: int) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-c", WRITE, str(n_episodes), str(seed)],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+        env={**os.environ, "PYTHONPATH": PYTHONPATH},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -401,7 +405,7 @@ def test_a_killed_writer_leaves_no_dataset_and_the_same_call_completes(root: Pat
     recordings = random_recordings(2)
     write(recordings)
     assert listed() == {NEW}
-    np.testing.assert_array_equal(reader.read_episodes(NEW)[1].obs, recordings[1].obs)
+    np.testing.assert_array_equal(read(NEW, Dataset.episodes)[1].obs, recordings[1].obs)
     assert left_behind(root) == {
         f"{NEW}/{name}" for name in (reader.DATA_FILE, reader.METADATA_FILE, reader.MANIFEST_FILE)
     }
@@ -410,9 +414,13 @@ def test_a_killed_writer_leaves_no_dataset_and_the_same_call_completes(root: Pat
 def test_a_script_needs_no_main_guard(root: Path, tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text("from test_writer import random_recordings, write\nprint('begun')\nwrite(random_recordings(2))\n")
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     command = [sys.executable, str(script)]
-    assert subprocess.run(command, env=environment, timeout=60, capture_output=True, text=True).stdout == "begun\n"
+    assert (
+        subprocess.run(
+            command, env={**os.environ, "PYTHONPATH": PYTHONPATH}, timeout=60, capture_output=True, text=True
+        ).stdout
+        == "begun\n"
+    )
     assert listed() == {NEW}
 
 
@@ -424,5 +432,5 @@ def test_of_two_writers_of_one_id_one_wins_whole_and_the_other_is_told(root: Pat
     (winner,) = winners
     assert output[winner][0] == f"written {NEW}\n"
     assert f"BadInput: dataset {NEW} exists already; choose another name" in output[3 - winner][1]
-    assert reader.read_metadata(NEW)["description"] == str(winner)
-    np.testing.assert_array_equal(reader.read_episodes(NEW)[2].obs, random_recordings(3, seed=winner)[2].obs)
+    assert read(NEW, lambda ds: ds.metadata)["description"] == str(winner)
+    np.testing.assert_array_equal(read(NEW, Dataset.episodes)[2].obs, random_recordings(3, seed=winner)[2].obs)

@@ -16,9 +16,10 @@ import gymnasium
 import numpy as np
 import pytest
 from conftest import COLLECTED, SHORT_HORIZON
+from read_dataset import read
 
 from zest_rl.agents import load_policy
-from zest_rl.data import reader
+from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.evaluation import evaluate as evaluation
 from zest_rl.evaluation.evaluate import (
@@ -75,7 +76,7 @@ class Replay:
 def replay(trained: Path) -> Callable[..., tuple[Replay, Arrays]]:
     """Roll out the policy of a run along the first recorded episode, in which the microwave opens."""
     seed = int(np.random.SeedSequence([0, 0]).generate_state(2)[0])  # as `zest_rl.kitchen.collect.rollout` draws it
-    actions = reader.read_episodes(COLLECTED)[0].actions
+    actions = read(COLLECTED, Dataset.episodes)[0].actions
 
     def play(name: str, config: EvaluationConfig = ONLINE, scorer: StateScorer | None = None) -> tuple[Replay, Arrays]:
         policy = Replay(trained / name, actions)
@@ -155,8 +156,8 @@ def test_the_return_to_go_falls_by_the_score_of_each_new_state(
     scored = load_scorer(trained / "dt-0").score_episode(traces["qpos"][0])
     np.testing.assert_allclose(traces["score"][0], scored, atol=1e-5)
     source = policy.meta["dataset"]["id"]
-    np.testing.assert_allclose(traces["score"][0], reader.read_scores(source)[0], atol=1e-5)
-    np.testing.assert_array_equal(traces["gt_reward"][0, 1:], reader.read_ground_truth(source)[0].rewards)
+    np.testing.assert_allclose(traces["score"][0], read(source, Dataset.scores)[0], atol=1e-5)
+    np.testing.assert_array_equal(traces["gt_reward"][0, 1:], read(source, Dataset.truth)[0].rewards)
     assert np.ptp(traces["score"]) > 0.1, "the microwave stays shut: this test could not fail"
 
 

@@ -18,10 +18,12 @@ from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 from PIL import Image
 from pyarrow import parquet
+from read_dataset import read
 
 from zest_rl import cli
 from zest_rl.data import reader
 from zest_rl.data.observations import is_numbers
+from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.export import export, transitions
 from zest_rl.export.lerobot import DATA_FILE
@@ -114,9 +116,9 @@ def corl(arrays: Any) -> dict[str, np.ndarray]:
 
 
 def test_transitions_are_the_dataset_s_unshifted(scored: str) -> None:
-    episodes, scores = reader.read_episodes(scored), reader.read_scores(scored)
+    episodes, scores = read(scored, Dataset.episodes), read(scored, Dataset.scores)
     for episode, score, truth, found in zip(
-        episodes, scores, reader.read_ground_truth(scored), transitions(scored), strict=True
+        episodes, scores, read(scored, Dataset.truth), transitions(scored), strict=True
     ):
         for t in range(len(episode)):
             np.testing.assert_array_equal(found["observations"][t], episode.obs[t])
@@ -215,7 +217,7 @@ def test_lerobot_folders_hold_a_row_per_frame_and_progress_beside_them(scored: s
     info = json.loads((folder / "meta/info.json").read_text())
     assert (info["fps"], info["total_episodes"], info["total_frames"]) == (10, 4, 400)
     assert set(info["features"]) == set(rows)
-    scores = np.concatenate([score[:-1] for score in reader.read_scores(scored)])
+    scores = np.concatenate([score[:-1] for score in read(scored, Dataset.scores)])
     progress = parquet.read_table(folder / "sarm_progress.parquet").to_pydict()
     np.testing.assert_array_equal(progress["zest_score"], scores)
     assert (min(progress["progress_sparse"]), max(progress["progress_sparse"])) == (0, 1)
@@ -368,7 +370,7 @@ def test_progress_of_pictures_alone_is_exported_and_told_of_by_inspect(
     told = zest("export", scored["dataset"], "--to", "lerobot-progress", "--output", tmp_path / "progress.parquet")
     assert (told["n_episodes"], told["n_transitions"], told["arrays"]) == (3, 7, ["zest_score"])
     rows = parquet.read_table(told["file"]).to_pydict()
-    scores = [score[:-1] for score in reader.read_scores(scored["dataset"])]
+    scores = [score[:-1] for score in read(scored["dataset"], Dataset.scores)]
     np.testing.assert_array_equal(rows["zest_score"], np.concatenate(scores))
     assert scored["next"] == f"zest inspect {scored['dataset']}"
     assert scored["dataset"] in zest(*scored["next"].split()[1:], "--output", tmp_path / "page.html")["datasets"]
@@ -402,7 +404,7 @@ def test_discrete_actions_stay_whole_numbers_for_those_that_take_them(
         assert not (tmp_path / to).exists()
     assert export(scored, "lerobot-progress", tmp_path / "progress").n_transitions == 10
     with pytest.raises(BadInput, match="its actions are discrete, a policy here acts by continuous ones"):
-        reader.read_episodes(scored)
+        read(scored, Dataset.episodes)
 
 
 def test_several_whole_numbers_per_action_are_not_taken_for_one(root: Path, tmp_path: Path) -> None:
@@ -414,7 +416,7 @@ def test_several_whole_numbers_per_action_are_not_taken_for_one(root: Path, tmp_
     assert not (tmp_path / "x").exists()
     for i, space in enumerate((spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2))):
         with pytest.raises(BadInput, match="its actions are discrete"):
-            reader.read_episodes(write_minari(f"room/bits{i}-v0", root, spaces.Dict(ROOM), space))
+            read(write_minari(f"room/bits{i}-v0", root, spaces.Dict(ROOM), space), Dataset.episodes)
 
 
 @pytest.mark.parametrize(
@@ -445,7 +447,7 @@ def test_infos_are_not_measured_by_the_space_of_the_observations(root: Path) -> 
 def test_bare_observations_of_any_form_are_flattened(root: Path, space: spaces.Space[Any], n: int) -> None:
     name = write_minari("room/bare-v0", root, space, spaces.Box(-1, 1, (2,), np.float32))
     with h5py.File(root / name / "data/main_data.hdf5") as file:
-        for i, episode in enumerate(reader.read_episodes(name)):
+        for i, episode in enumerate(read(name, Dataset.episodes)):
             stored = file[f"episode_{i}/observations"][()]
             np.testing.assert_array_equal(episode.obs, stored.reshape(-1, n).astype(np.float32))
 

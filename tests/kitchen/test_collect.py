@@ -13,10 +13,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from read_dataset import read
 
 from zest_rl.cli import main
 from zest_rl.cli.collect import FLAWS
 from zest_rl.data import reader
+from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen import collect
 from zest_rl.kitchen.collect import (
@@ -366,14 +368,14 @@ def test_the_command_tells_what_it_made(uncut: tuple[Path, dict[str, Any]], monk
     assert (result["dataset"], result["path"]) == (DATASET, str(folder / "minari" / DATASET))
     assert result["next"] == f"zest relabel {DATASET} --goal same-scene"
     assert (result["n_episodes"], result["noise_max"]) == (3, 0.5)
-    truths = reader.read_ground_truth(DATASET)
+    truths = read(DATASET, Dataset.truth)
     assert result["n_failed"] == sum(not truth.success for truth in truths)
     span = result["expert_return"] - result["minimum_return"]
     mean = np.mean([100 * (truth.episode_return - result["minimum_return"]) / span for truth in truths])
     estimate = result["normalized_return"]
     assert estimate["value"] == pytest.approx(mean)
     assert estimate["low"] <= mean <= estimate["high"]
-    metadata = reader.read_metadata(DATASET)
+    metadata = read(DATASET, lambda ds: ds.metadata)
     assert (metadata["ref_min_score"], metadata["ref_max_score"]) == (result["minimum_return"], result["expert_return"])
     assert metadata["zest"]["collect"]["asked"]["noise_max"] == 0.5
     assert not parts(folder / "cache")
@@ -443,8 +445,8 @@ def test_a_killed_command_goes_on_where_it_stopped_and_ends_with_the_same_datase
 
     result = collect_into(tmp_path, monkeypatch)
     assert {path: path.stat().st_mtime_ns for path in references} == references
-    resumed = reader.describe(DATASET)
+    resumed = read(DATASET, Dataset.describe)
     folder, uncut_result = uncut
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
-    assert resumed == reader.describe(DATASET)
+    assert resumed == read(DATASET, Dataset.describe)
     assert {**result, "path": None} == {**uncut_result, "path": None}

@@ -7,8 +7,9 @@ from pathlib import Path
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+from read_dataset import read
 
-from zest_rl.data import reader as data
+from zest_rl.data.reader import Dataset
 from zest_rl.kitchen.scene import RenderConfig, open_renderer
 from zest_rl.kitchen.videos import (
     FPS,
@@ -24,7 +25,7 @@ N_FRAMES = 8
 @pytest.fixture
 def states(collected: str) -> np.ndarray:
     """Every twelfth state of an episode in which the microwave opens."""
-    return data.read_states(collected)[0][::12][:N_FRAMES]
+    return read(collected, Dataset.states)[0][::12][:N_FRAMES]
 
 
 def test_a_video_is_h264_with_one_frame_per_state_and_shows_the_states(states: np.ndarray, tmp_path: Path) -> None:

@@ -17,9 +17,11 @@ import h5py
 import minari
 import numpy as np
 import pytest
+from read_dataset import read
 
 from zest_rl.cli import main
 from zest_rl.data import reader
+from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.views import Views
 from zest_rl.rewards.relabel import (
@@ -128,28 +130,28 @@ def test_rewards_are_the_scores_and_everything_else_stays_bit_for_bit(relabeled:
 
 
 def test_the_package_and_minari_read_the_same_rewards(relabeled: Relabeled) -> None:
-    ours = reader.read_episodes(relabeled.dataset_id)
+    ours = read(relabeled.dataset_id, Dataset.episodes)
     theirs = list(minari.load_dataset(relabeled.dataset_id).iterate_episodes())
-    for episode, scores, other in zip(ours, reader.read_scores(relabeled.dataset_id), theirs, strict=True):
+    for episode, scores, other in zip(ours, read(relabeled.dataset_id, Dataset.scores), theirs, strict=True):
         np.testing.assert_array_equal(episode.rewards, scores[1:])
         np.testing.assert_array_equal(episode.rewards, other.rewards)
 
 
 def test_the_score_tells_the_episodes_that_open_the_microwave_from_the_one_that_does_not(relabeled: Relabeled) -> None:
-    scores = [episode.rewards.sum() for episode in reader.read_episodes(relabeled.dataset_id)]
-    successes = [truth.success for truth in reader.read_ground_truth(relabeled.dataset_id)]
+    scores = [episode.rewards.sum() for episode in read(relabeled.dataset_id, Dataset.episodes)]
+    successes = [truth.success for truth in read(relabeled.dataset_id, Dataset.truth)]
     assert sorted(successes) == [False, True, True, True]
     assert np.argmin(scores) == np.argmin(successes)
 
 
 def test_the_metadata_tells_how_the_rewards_were_made(relabeled: Relabeled) -> None:
-    metadata = reader.read_metadata(relabeled.dataset_id)
+    metadata = read(relabeled.dataset_id, lambda ds: ds.metadata)
     assert metadata["dataset_id"] == relabeled.dataset_id
     assert metadata["description"].endswith("Rewards are scores (cos+delta, level) by efficientnet-lite0.")
-    assert metadata["zest"]["collect"] == reader.read_metadata(SOURCE)["zest"]["collect"]
+    assert metadata["zest"]["collect"] == read(SOURCE, lambda ds: ds.metadata)["zest"]["collect"]
     facts = metadata["zest"]["relabel"]
     assert facts["source"] == SOURCE
-    assert facts["source_sha256"] == reader.fingerprint(SOURCE)
+    assert facts["source_sha256"] == read(SOURCE, Dataset.fingerprint)
     assert facts["reward"] == "level"
     assert facts["scorer"]["config"] == {"views": asdict(VIEWS), **asdict(CONFIG)}
     assert facts["scorer"] == json.loads(json.dumps(relabeled.scorer.describe()))
@@ -159,8 +161,8 @@ def test_the_metadata_tells_how_the_rewards_were_made(relabeled: Relabeled) -> N
 
 def test_the_scorer_beside_the_data_scores_them_as_they_were_scored(relabeled: Relabeled) -> None:
     scorer = StateScorer.load(relabeled.path / SCORER_FILE, n_workers=1)
-    written = reader.read_scores(relabeled.dataset_id)
-    for states, scores in zip(reader.read_states(SOURCE), written, strict=True):
+    written = read(relabeled.dataset_id, Dataset.scores)
+    for states, scores in zip(read(SOURCE, Dataset.states), written, strict=True):
         np.testing.assert_array_equal(scorer.score_episode(states), scores)
 
 
@@ -190,7 +192,7 @@ def test_the_name_says_where_the_dataset_comes_from_and_is_a_hash_of_how_it_was_
     assert all(reader.DATASET_ID.fullmatch(name) and name.startswith("zest/kitchen-micro-tiny-zest-") for name in names)
     assert sum(other.n_embedded for other in others) == 0, "the states were embedded already"
     for scores, episode in zip(
-        reader.read_scores(relabeled.dataset_id), reader.read_episodes(others[0].dataset_id), strict=True
+        read(relabeled.dataset_id, Dataset.scores), read(others[0].dataset_id, Dataset.episodes), strict=True
     ):
         np.testing.assert_array_equal(episode.rewards, np.diff(scores))
 
@@ -202,13 +204,13 @@ def test_the_name_says_where_the_dataset_comes_from_and_is_a_hash_of_how_it_was_
 def test_a_null_control_and_a_choice_of_goals_are_datasets_of_their_own(relabeled: Relabeled, places: Path) -> None:
     null = relabel_kitchen(CONFIG, shuffle=3, n_workers=1)
     rewards, nulls = (
-        [e.rewards for e in reader.read_episodes(name)] for name in (relabeled.dataset_id, null.dataset_id)
+        [e.rewards for e in read(name, Dataset.episodes)] for name in (relabeled.dataset_id, null.dataset_id)
     )
     assert sorted(map(bytes, nulls)) == sorted(map(bytes, rewards))
     assert not any(np.array_equal(reward, own) for reward, own in zip(nulls, rewards, strict=True))
-    assert reader.read_metadata(null.dataset_id)["zest"]["relabel"]["shuffle"] == 3
+    assert read(null.dataset_id, lambda ds: ds.metadata)["zest"]["relabel"]["shuffle"] == 3
     chosen = relabel_kitchen(replace(CONFIG, goal=str(DRAWINGS), goal_share=0.4), n_workers=1)
-    kept = reader.read_metadata(chosen.dataset_id)["zest"]["relabel"]["kept_goals"]
+    kept = read(chosen.dataset_id, lambda ds: ds.metadata)["zest"]["relabel"]["kept_goals"]
     assert len(kept) == 1
     assert len(list((chosen.path / GOAL_FOLDER / "goal").iterdir())) == 1
     assert len({relabeled.dataset_id, null.dataset_id, chosen.dataset_id}) == 3
@@ -321,13 +323,18 @@ def test_nothing_flows_from_the_ground_truth_into_rewards_or_policies(
         monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / name))
         monkeypatch.setenv("ZEST_CACHE", str(tmp_path / f"{name} cache"))
         prepare(SOURCE)
-        truth = [gt.rewards for gt in reader.read_ground_truth(SOURCE)]
+        truth = [gt.rewards for gt in read(SOURCE, Dataset.truth)]
         made = relabel_kitchen(CONFIG, n_workers=1).dataset_id
         for agent in ("bc", "dt"):
             small = ["--n-updates", "10", "--hidden-size", "16", "--n-layers", "1", "--batch-size", "8"]
             run = ["--run-dir", str(tmp_path / f"{name} {agent}"), "--threads", "1", "--device", "cpu"]
             assert main(["train", agent, made, *small, *run]) == 0
-        return {"id": made, "truth": truth, "scores": reader.read_scores(made), "episodes": reader.read_episodes(made)}
+        return {
+            "id": made,
+            "truth": truth,
+            "scores": read(made, Dataset.scores),
+            "episodes": read(made, Dataset.episodes),
+        }
 
     real, noise = (
         relabel_and_train("real", lambda _: None),

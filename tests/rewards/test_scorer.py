@@ -10,8 +10,9 @@ import open_clip
 import pytest
 import safetensors.numpy
 import torch
+from read_dataset import read
 
-from zest_rl.data import reader
+from zest_rl.data.reader import Dataset
 from zest_rl.embedders import load_embedder
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen.env import KitchenEnv
@@ -41,7 +42,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Any:
 def episodes(collected_root: Path) -> list[np.ndarray]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MINARI_DATASETS_PATH", str(collected_root))
-        return reader.read_states("zest/kitchen-micro-tiny-v0")
+        return read("zest/kitchen-micro-tiny-v0", Dataset.states)
 
 
 @pytest.fixture(scope="module")

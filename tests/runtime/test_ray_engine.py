@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from read_dataset import read
 
-from zest_rl.data import reader
+from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.rewards.embeddings import check_same_embedder, shared_embedder
 from zest_rl.runtime import ray_engine
@@ -130,14 +131,14 @@ def test_the_kitchen_is_relabeled_on_ray_to_the_same_rewards(
 ) -> None:
     words = ["relabel", collected, "--views", "1", "--tolerance", "0.2"]
     on_ray = zest(*words, "--engine", "ray")
-    expected = reader.read_scores(on_ray["dataset"])
+    expected = read(on_ray["dataset"], Dataset.scores)
     assert on_ray["n_distinct_states_embedded"] > 0
     assert zest(*words, "--engine", "local")["dataset"] == on_ray["dataset"]
     monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "another"))
     (tmp_path / "minari" / on_ray["dataset"]).rename(tmp_path / "away")
     here = zest(*words, "--engine", "local")
     assert here["dataset"] == on_ray["dataset"]
-    for ours, theirs in zip(reader.read_scores(here["dataset"]), expected, strict=True):
+    for ours, theirs in zip(read(here["dataset"], Dataset.scores), expected, strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 

@@ -1,0 +1,16 @@
+"""Opens a dataset for a single read, as tests do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from zest_rl.data.reader import Dataset, open_dataset
+
+T = TypeVar("T")
+
+
+def read(dataset_id: str, what: Callable[[Dataset], T]) -> T:
+    """Return what is read of a dataset: ``read(name, Dataset.scores)``."""
+    with open_dataset(dataset_id) as ds:
+        return what(ds)
