@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from read_dataset import read
 
 from zest_rl.analysis.episode_view import N_FRAMES, EpisodeView
-from zest_rl.data import reader
+from zest_rl.data.reader import Dataset
 from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.rewards.scorer import ScorerConfig
 from zest_rl.rewards.scores import Features
@@ -19,7 +20,7 @@ VIEWS = Views("micro", n_views=2, size=96, tolerance=0.05)
 def test_an_episode_is_shown_with_its_scores_by_view_and_its_change_in_pixels(
     collected: str, goal: str, features: Features
 ) -> None:
-    states = reader.read_states(collected)[0]
+    states = read(collected, Dataset.states)[0]
     scorer = StateScorer.build(ScorerConfig(goal, features=features), VIEWS, states[0], n_workers=1)
     view = EpisodeView(scorer, states)
     np.testing.assert_allclose(view.scores, scorer.score_episode(states), atol=1e-6)

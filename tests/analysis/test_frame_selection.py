@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from read_dataset import read
 
 from tests.conftest import COLLECTED
 from zest_rl.analysis.frame_selection import Candidates, draw_candidates, score_as_actions, score_as_goals
-from zest_rl.data import reader
+from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.tasks import TASKS
 from zest_rl.kitchen.views import Views
@@ -30,7 +31,7 @@ def candidates(collected: str) -> Candidates:
 
 
 def test_frames_are_drawn_with_their_trajectory_its_start_and_its_task(candidates: Candidates) -> None:
-    episodes = reader.read_states(COLLECTED)
+    episodes = read(COLLECTED, Dataset.states)
     assert len(candidates.states) == len(candidates.trajectory) == 40
     assert candidates.task == ("micro",) * len(episodes)
     for state, trajectory in zip(candidates.states, candidates.trajectory, strict=True):
@@ -44,7 +45,7 @@ def test_frames_are_drawn_with_their_trajectory_its_start_and_its_task(candidate
 
 def test_satisfied_goals_are_those_of_the_recorded_ground_truth(collected: str) -> None:
     every = draw_candidates([collected], 10**6)
-    truth = np.concatenate([episode.rewards for episode in reader.read_ground_truth(collected)])
+    truth = np.concatenate([episode.rewards for episode in read(collected, Dataset.truth)])
     np.testing.assert_array_equal(every.satisfies(MICRO), truth >= 0.999)
     assert every.satisfies(MICRO).any()
     assert not every.satisfies(TASKS["sdoor"]).any(), "nobody touched the sliding door"

@@ -11,6 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from read_dataset import read
 
 from tests.conftest import COLLECTED, collect_some
 from zest_rl.analysis.cross_task import Confusion, confusion, confusion_warnings, inspect_datasets
@@ -18,6 +19,7 @@ from zest_rl.analysis.inspection import Inspection, inspect, labels
 from zest_rl.analysis.reward_figures import FIGURES, warnings
 from zest_rl.data import reader
 from zest_rl.data.provenance import RelabelRecord, ScorerRecord
+from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput
 from zest_rl.kitchen import scene
 from zest_rl.kitchen.views import Views
@@ -47,14 +49,14 @@ def episodes_file(dataset_id: str) -> Path:
 
 def test_figures_are_those_of_the_recorded_scores_and_ground_truth(scored: str) -> None:
     found = inspect(scored)
-    returns = np.array([score[1:].sum() for score in reader.read_scores(scored)])
-    truth = np.array([episode.episode_return for episode in reader.read_ground_truth(scored)])
+    returns = np.array([score[1:].sum() for score in read(scored, Dataset.scores)])
+    truth = np.array([episode.episode_return for episode in read(scored, Dataset.truth)])
     assert set(found.figures) == {figure.key for figure in FIGURES}
     assert found.figures["spearman"] == statistics.spearman(returns, truth)
     assert found.figures["pairwise"] == reward_quality.pairwise_accuracy(returns, truth)
     assert found.figures["contradictory"].value == 0
     assert found.task == "micro"
-    scores, success = reader.read_scores(scored), [episode.success for episode in reader.read_ground_truth(scored)]
+    scores, success = read(scored, Dataset.scores), [episode.success for episode in read(scored, Dataset.truth)]
     for name, wanted in (("successes", True), ("failures", False)):
         group = [score[1:] for score, won in zip(scores, success, strict=True) if won == wanted]
         assert (name in found.over_time) == bool(group)
@@ -135,8 +137,8 @@ def test_constant_scores_and_constant_returns_are_warned_of() -> None:
 def test_differences_are_judged_as_the_trainer_sees_them(collected: str, scored: str) -> None:
     differences = relabel_source(kitchen_source(collected, VIEWS), CONFIG, reward="difference", n_workers=1).dataset_id
     found, level = inspect(differences), inspect(scored)
-    last = np.array([score[-1] - score[0] for score in reader.read_scores(differences)])
-    truth = np.array([episode.episode_return for episode in reader.read_ground_truth(differences)])
+    last = np.array([score[-1] - score[0] for score in read(differences, Dataset.scores)])
+    truth = np.array([episode.episode_return for episode in read(differences, Dataset.truth)])
     assert found.figures["spearman"].value == pytest.approx(statistics.spearman(last, truth).value)
     assert found.figures["contradictory"].value == 0, "levels repeat where states do, differences need not"
     assert found.figures["value_order"] != level.figures["value_order"]
@@ -184,15 +186,15 @@ def test_each_goal_scores_the_ends_of_all_tasks_as_their_own_views_show_them(
     assert len(done) == 3
     ids = collected, "zest/kitchen-sdoor-tiny-v0"
     assert list(compared.sources.items()) == [
-        ((ids[0], reader.fingerprint(ids[0])), "micro"),
-        ((ids[1], reader.fingerprint(ids[1])), "sdoor"),
+        ((ids[0], read(ids[0], Dataset.fingerprint)), "micro"),
+        ((ids[1], read(ids[1], Dataset.fingerprint)), "sdoor"),
     ]
     assert compared.row_names() == ("micro", "sdoor")
     assert compared.own_rows == (0, 1, 0), "what was relabeled twice is one row"
     means = compared.means
     assert means.shape == (2, 3)
     for i, dataset in enumerate(of_two_tasks):
-        own = np.mean([score[-1] for score in reader.read_scores(dataset)])
+        own = np.mean([score[-1] for score in read(dataset, Dataset.scores)])
         assert means[i, i] == pytest.approx(own, abs=1e-5)
         assert means[i, i] > means[1 - i, i], "an open door looks more like itself than like another one"
         assert means[1 - i, i] != 0, "something is seen to change"

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import pytest
 from conftest import COLLECTED
 from PIL import Image
@@ -76,6 +77,37 @@ def test_training_on_scores_leaves_their_scorer_beside_the_policy(
     name = "zest_scorer.safetensors"
     assert (tmp_path / "scored" / name).read_bytes() == (reader.dataset_path(dataset) / name).read_bytes()
     assert not (tmp_path / "truth" / name).exists()
+
+
+@pytest.mark.parametrize("verb", ["export", "inspect", "train bc", "relabel"])
+def test_a_dataset_is_hashed_and_opened_once_however_much_is_read_of_it(
+    verb: str, trained: Path, zest: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = artifacts.read_json(trained / "dt-0" / "meta.json")["dataset"]["id"]
+    path = reader.dataset_path(dataset)
+    hash_file, open_file = artifacts.hash_file, h5py.File.__init__
+    hashed, opened = [], []
+
+    def counted_hash(file: Path) -> str:
+        hashed.append(file)
+        return hash_file(file)
+
+    def counted_open(self: h5py.File, name: Any, *arguments: Any, **options: Any) -> None:
+        opened.append(name)
+        open_file(self, name, *arguments, **options)
+
+    monkeypatch.setattr(artifacts, "hash_file", counted_hash)
+    monkeypatch.setattr(h5py.File, "__init__", counted_open)
+    options = {
+        "export": ("--output", tmp_path / "data.npz"),
+        "inspect": ("--output", tmp_path / "page.html", "--n-workers", "1"),
+        "train bc": (*SMALL, "--run-dir", tmp_path / "run"),
+        "relabel": ("--views", "1", "--tolerance", "0.05", "--n-workers", "1"),
+    }
+    zest(*verb.split(), dataset, *options[verb])
+    files = [path / name for name in artifacts.read_json(path / reader.MANIFEST_FILE)]
+    assert sorted(file for file in hashed if file.is_relative_to(path)) == sorted(files)
+    assert [name for name in opened if name == path / reader.DATA_FILE] == [path / reader.DATA_FILE]
 
 
 def test_a_rerun_of_a_finished_verb_changes_nothing(

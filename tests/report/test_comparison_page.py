@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import COLLECTED
+from read_dataset import read
 
 from zest_rl.data import reader
+from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import EvaluationConfig, evaluate
 from zest_rl.kitchen.videos import Video
@@ -96,7 +98,7 @@ def test_a_row_sums_up_the_episodes_of_all_its_seeds(evaluated: Path) -> None:
 
 def test_the_dataset_s_own_row_is_its_normalized_ground_truth(trained: Path) -> None:
     row = dataset_row(scored_dataset(trained), paper=81.19)
-    truth = reader.read_ground_truth(COLLECTED)
+    truth = read(COLLECTED, Dataset.truth)
     assert row.mean == pytest.approx(np.mean([100 * episode.episode_return / 70 for episode in truth]))
     assert row.success_rate == np.mean([episode.success for episode in truth])
     assert (row.method, row.n_episodes, row.paper_value) == ("Demo", 4, 81.19)

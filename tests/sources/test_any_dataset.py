@@ -28,9 +28,11 @@ from gymnasium import spaces
 from gymnasium_robotics.utils import mujoco_utils
 from minari.data_collector import EpisodeBuffer
 from PIL import Image
+from read_dataset import read
 
 from zest_rl import cli
 from zest_rl.data import reader
+from zest_rl.data.reader import Dataset
 from zest_rl.data.writer import write_scored
 from zest_rl.embedders import load_embedder
 from zest_rl.errors import ZestError
@@ -214,7 +216,7 @@ def check_kept_but_the_rewards(source_id: str, relabeled_id: str) -> None:
             np.testing.assert_array_equal(kept, np.concatenate([[0], array]).astype(np.float32))
         else:
             assert list(map(bytes, np.atleast_1d(after[name]))) == list(map(bytes, np.atleast_1d(array)))
-    for ours, theirs in zip(reader.read_rewards(relabeled_id), minari.load_dataset(relabeled_id), strict=True):
+    for ours, theirs in zip(read(relabeled_id, Dataset.rewards), minari.load_dataset(relabeled_id), strict=True):
         np.testing.assert_array_equal(ours, theirs.rewards)
 
 
@@ -236,15 +238,15 @@ def test_the_named_camera_is_scored_by_the_definition(
     assert result["views"] == ["observations/cameras/top"]
     assert (result["n_frames"], result["n_episodes_embedded"]) == (sum(LENGTHS) + len(LENGTHS), len(LENGTHS))
     check_kept_but_the_rewards(pictured, result["dataset"])
-    for episode, scores in zip(maze, reader.read_scores(result["dataset"]), strict=True):
+    for episode, scores in zip(maze, read(result["dataset"], Dataset.scores), strict=True):
         np.testing.assert_allclose(scores, expected_scores([episode.frames], goal), atol=1e-4)
-    assert reader.read_scores(result["dataset"])[1][-1] > 0.99, "start and goal are pictures of this very episode"
+    assert read(result["dataset"], Dataset.scores)[1][-1] > 0.99, "start and goal are pictures of this very episode"
 
 
 def test_several_cameras_are_views_that_are_averaged(pictured: str, maze: list[Episode], goal: Path, zest: Run) -> None:
     result = zest("relabel", pictured, "--goal", goal, "--frames", "cameras/top", "cameras/turned")
     turned = [[frame[::-1] for frame in episode.frames] for episode in maze]
-    for episode, other, scores in zip(maze, turned, reader.read_scores(result["dataset"]), strict=True):
+    for episode, other, scores in zip(maze, turned, read(result["dataset"], Dataset.scores), strict=True):
         np.testing.assert_allclose(scores, expected_scores([episode.frames, other], goal), atol=1e-4)
 
 
@@ -263,7 +265,7 @@ def test_the_only_camera_is_found_by_itself_also_as_jpeg_in_a_flat_observation(
     result = zest("relabel", flat, "--goal", goal, "--n-workers", "1")
     assert result["views"] == ["observations"]
     check_kept_but_the_rewards(flat, result["dataset"])
-    for episode, scores in zip(minari.load_dataset(flat), reader.read_scores(result["dataset"]), strict=True):
+    for episode, scores in zip(minari.load_dataset(flat), read(result["dataset"], Dataset.scores), strict=True):
         np.testing.assert_allclose(scores, expected_scores([list(episode.observations)], goal), atol=1e-4)
 
 
@@ -273,7 +275,7 @@ def test_rewards_need_not_be_recorded(pictured: str, goal: Path, zest: Run, tmp_
         for episode in file.values():
             del episode["rewards"]
     made = zest("relabel", pictured, *words)["dataset"]
-    for scores, found in zip(reader.read_scores(made), minari.load_dataset(made), strict=True):
+    for scores, found in zip(read(made, Dataset.scores), minari.load_dataset(made), strict=True):
         np.testing.assert_array_equal(found.rewards, scores[1:])
         assert "source" not in found.infos
     zest("export", made, "--output", tmp_path / "maze.npz")
@@ -292,9 +294,9 @@ def test_episodes_that_minari_could_not_read_are_refused_before_any_work(
 
 def test_the_metadata_tells_where_the_frames_came_from(pictured: str, goal: Path, zest: Run) -> None:
     made = zest("relabel", pictured, "--goal", goal, "--frames", "cameras/top")["dataset"]
-    facts = reader.read_metadata(made)["zest"]["relabel"]
+    facts = read(made, lambda ds: ds.metadata)["zest"]["relabel"]
     assert facts["source"] == pictured
-    assert facts["source_sha256"] == reader.fingerprint(pictured)
+    assert facts["source_sha256"] == read(pictured, Dataset.fingerprint)
     assert facts["frames"]["views"] == ["observations/cameras/top"]
     assert facts["scorer"]["config"]["goal"] == str(goal)
     assert {"goal_sha256", "embedder_sha256"} <= facts["scorer"].keys()
@@ -359,14 +361,14 @@ def test_every_way_of_scoring_works_on_pictures(pictured: str, goal: Path, zest:
     level = zest(*base)["dataset"]
     difference = zest(*base, "--reward", "difference")["dataset"]
     raw = zest(*base, "--features", "raw", "--similarity", "l2")["dataset"]
-    for scores, rewards in zip(reader.read_scores(level), reader.read_rewards(difference), strict=True):
+    for scores, rewards in zip(read(level, Dataset.scores), read(difference, Dataset.rewards), strict=True):
         np.testing.assert_array_equal(rewards, np.diff(scores))
-    assert all((rewards <= 0).all() for rewards in reader.read_rewards(raw))
+    assert all((rewards <= 0).all() for rewards in read(raw, Dataset.rewards))
     many = goal.parent / "many"
     shutil.copytree(goal, many, dirs_exist_ok=True)
     Image.fromarray(np.zeros((SIDE, SIDE, 3), np.uint8)).save(many / "goal" / "1.png")
     chosen = zest(*base, "--goal", many, "--goal-share", "0.5")["dataset"]
-    assert len(reader.read_metadata(chosen)["zest"]["relabel"]["kept_goals"]) == 1
+    assert len(read(chosen, lambda ds: ds.metadata)["zest"]["relabel"]["kept_goals"]) == 1
     assert len({level, difference, raw, chosen}) == 4
 
 
@@ -374,8 +376,8 @@ def test_episodes_of_one_length_can_be_shuffled(maze: list[Episode], goal: Path,
     same = [episode for episode in maze if len(episode.actions) == LENGTHS[0]]
     flat = write_minari("maze/same-v0", same, lambda e: np.stack(e.frames), box(np.stack(maze[0].frames)))
     real, null = (zest("relabel", flat, "--goal", goal, *more)["dataset"] for more in ((), ("--shuffle", "0")))
-    one, other = reader.read_rewards(real)
-    np.testing.assert_array_equal(reader.read_rewards(null), [other, one])
+    one, other = read(real, Dataset.rewards)
+    np.testing.assert_array_equal(read(null, Dataset.rewards), [other, one])
 
 
 @pytest.mark.parametrize(
@@ -501,7 +503,7 @@ def test_states_are_rendered_as_the_environment_itself_shows_them_with_the_door_
     result = zest("relabel", dataset, "--goal", goal, "--camera", "fixed", "vil_camera", "--n-workers", "1")
     assert result["views"] == ["fixed", "vil_camera"]
     check_kept_but_the_rewards(dataset, result["dataset"])
-    facts = reader.read_metadata(result["dataset"])["zest"]["relabel"]["frames"]
+    facts = read(result["dataset"], lambda ds: ds.metadata)["zest"]["relabel"]["frames"]
     assert facts["qpos_from"] == [["infos/state/qpos", 0, None]]
     assert facts["scenery_from"] == ["infos/state/door_body_pos"]
     code, error = refusal("relabel", dataset, "--goal", goal, "--camera", "fixd")
@@ -723,7 +725,7 @@ def test_another_package_rebuilds_the_states_of_its_own_environment(
 
     register("own_robot:qpos")
     made = zest(*words)["dataset"]
-    assert reader.read_metadata(made)["zest"]["relabel"]["frames"]["qpos_from"] == "own_robot:qpos"
+    assert read(made, lambda ds: ds.metadata)["zest"]["relabel"]["frames"]["qpos_from"] == "own_robot:qpos"
     frames: Any = open_source(dataset).frames
     for i, episode in enumerate(episodes):
         np.testing.assert_allclose(frames._recorded(i)["qpos"], [state["qpos"] for state in episode.state], atol=1e-6)
@@ -761,13 +763,13 @@ def test_folders_of_videos_and_of_pictures_are_views(
         write_video(tmp_path / "films" / f"episode_{i}.mp4", episode.frames)
     dataset = blind(maze)
     top = zest("relabel", dataset, "--goal", goal, "--frames", tmp_path / "top", "--n-workers", "1")
-    for episode, scores in zip(maze, reader.read_scores(top["dataset"]), strict=True):
+    for episode, scores in zip(maze, read(top["dataset"], Dataset.scores), strict=True):
         np.testing.assert_allclose(scores, expected_scores([episode.frames], goal), atol=1e-4)
     folders = [tmp_path / "top", tmp_path / "films"]
     both = zest("relabel", dataset, "--goal", goal, "--frames", *folders, "--n-workers", "1")
     assert both["views"] == ["top", "films"]
     films = [imageio.mimread(tmp_path / "films" / f"episode_{i}.mp4") for i in range(len(maze))]
-    for episode, film, scores in zip(maze, films, reader.read_scores(both["dataset"]), strict=True):
+    for episode, film, scores in zip(maze, films, read(both["dataset"], Dataset.scores), strict=True):
         np.testing.assert_allclose(scores, expected_scores([episode.frames, list(film)], goal), atol=1e-4)
 
 
@@ -786,7 +788,7 @@ def test_one_frame_may_be_missing_at_the_end_and_no_more(
                 Image.fromarray(frame).save(folder / f"{t}.png")
 
     leave(1)
-    scores = reader.read_scores(zest(*words)["dataset"])
+    scores = read(zest(*words)["dataset"], Dataset.scores)
     for episode, one in zip(maze, scores, strict=True):
         np.testing.assert_allclose(one[:-1], expected_scores([episode.frames[:-1]], goal), atol=1e-4)
         assert one[-1] == one[-2]
@@ -994,7 +996,7 @@ def test_a_part_of_a_lerobot_dataset_keeps_its_order_whatever_its_numbers(
     for i in range(len(maze)):
         np.testing.assert_array_equal(list(part.frames.read(i)), list(whole.frames.read(i)))
     made = zest("relabel", tmp_path / "part", "--goal", goal, "--n-workers", "1")["dataset"]
-    assert [len(rewards) for rewards in reader.read_rewards(made)] == list(LENGTHS)
+    assert [len(rewards) for rewards in read(made, Dataset.rewards)] == list(LENGTHS)
     listed = tmp_path / "part" / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
     shutil.copyfile(listed, listed.with_name("file-001.parquet"))
     code, error = refusal("relabel", tmp_path / "part", "--goal", goal)
@@ -1044,7 +1046,7 @@ def test_ends_are_those_of_the_dataset_that_was_exported(
             Image.fromarray(frame).save(path)
     exported = zest("export", dataset, "--to", form, "--output", tmp_path / "exported.hdf5")["file"]
     made = zest("relabel", exported, "--goal", goal, "--frames", tmp_path / "films", "--n-workers", "1")["dataset"]
-    assert [episode.terminated for episode in reader.read_episodes(made)] == [False, True, False]
+    assert [episode.terminated for episode in read(made, Dataset.episodes)] == [False, True, False]
 
 
 # --- what is kept and checked -----------------------------------------------------------------------------------------
@@ -1118,13 +1120,13 @@ def test_policies_are_trained_on_it_it_is_exported_and_inspected_and_not_evaluat
     flat = [np.concatenate([rows(e, "achieved_goal"), rows(e, "observation")], axis=1)[:-1] for e in maze]
     np.testing.assert_array_equal(arrays_["observations"], np.concatenate(flat).astype(np.float32))
     np.testing.assert_array_equal(arrays_["source_reward"], np.concatenate([e.rewards for e in maze]))
-    np.testing.assert_array_equal(arrays_["rewards"], np.concatenate(reader.read_rewards(made)))
+    np.testing.assert_array_equal(arrays_["rewards"], np.concatenate(read(made, Dataset.rewards)))
     inspected = zest("inspect", made, "--output", tmp_path / "page.html")
     figures = inspected["datasets"][made]["figures"]
     assert figures.keys() == {
         "Value-order correlation", "Told by the step", "Straight in time", "Saturated", "Nothing to see",
     }  # fmt: skip
-    still = [score[1:] == 0 for score in reader.read_scores(made)]
-    assert sum(map(np.sum, still)) == reader.read_metadata(made)["zest"]["relabel"]["n_still_frames"]
+    still = [score[1:] == 0 for score in read(made, Dataset.scores)]
+    assert sum(map(np.sum, still)) == read(made, lambda ds: ds.metadata)["zest"]["relabel"]["n_still_frames"]
     assert figures["Nothing to see"]["value"] == pytest.approx(np.mean([episode.mean() for episode in still]))
     assert made in (tmp_path / "page.html").read_text()

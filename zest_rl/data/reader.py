@@ -78,36 +78,6 @@ def exists(dataset_id: str) -> bool:
     return (dataset_path(dataset_id) / METADATA_FILE).exists()
 
 
-def read_metadata(dataset_id: str) -> dict[str, Any]:
-    """Return a dataset's metadata after checking that its files are as they were written.
-
-    Whoever builds an environment from them checks them by `zest_rl.data.env_specs` first; reading runs no code of it.
-
-    Raises:
-        BadInput: no such dataset (the nearest are named), or an env_spec in it is none.
-        ZestError: a file was damaged or changed since it was written.
-    """
-    folder = dataset_path(dataset_id)
-    if not exists(dataset_id):
-        raise BadInput(
-            f"there is no dataset {dataset_id!r} under the Minari root; {nearest(dataset_id, list_datasets())}. "
-            "Make one with `zest collect`, or set MINARI_DATASETS_PATH to the folder that holds it"
-        )
-    if (folder / MANIFEST_FILE).exists():
-        for name, digest in artifacts.read_json(folder / MANIFEST_FILE).items():
-            path = folder / name
-            if not path.exists() or artifacts.hash_file(path) != digest:
-                raise ZestError(
-                    f"{name} of dataset {dataset_id} is missing or was changed since it was written; make the dataset "
-                    f"again, or, if you changed it on purpose, delete its {MANIFEST_FILE}"
-                )
-    metadata: dict[str, Any] = artifacts.read_json(folder / METADATA_FILE)
-    for key in ("env_spec", "eval_env_spec"):
-        if metadata.get(key):
-            entry_points(metadata[key], f"the {key} of dataset {dataset_id}")
-    return metadata
-
-
 @dataclass(frozen=True)
 class Dataset:
     """An open dataset, whose files were found as they were written. Made by `open_dataset`."""
@@ -173,7 +143,7 @@ class Dataset:
         Raises:
             BadInput: there are none.
         """
-        return self._each(lambda group: self._array(group, "rewards", np.float32))
+        return self._arrays("rewards")
 
     def states(self) -> list[NDArray[np.float64]]:
         """Read the simulator positions (T+1, nq) of every episode.
@@ -219,12 +189,13 @@ class Dataset:
         Raises:
             BadInput: the dataset was not relabeled.
         """
-        return self._each(lambda group: self._array(group, "infos/zest/score", np.float32))
+        return self._arrays("infos/zest/score")
 
     def source_rewards(self) -> list[FloatArray] | None:
         """Read the rewards (T,) that a dataset of another environment had before it was relabeled; None: no such."""
-        read = self._each(lambda group: self._source_reward(group) if SOURCE_REWARD in group else None)
-        return None if any(rewards is None for rewards in read) else read
+        if not all(SOURCE_REWARD in group for group in self.groups.values()):
+            return None
+        return [rewards[1:] for rewards in self._arrays(SOURCE_REWARD)]
 
     def rewards_to_keep(self) -> list[FloatArray | None]:
         """Read the rewards (T,) of every episode that a copy keeps as its source's; None: none, or ground truth."""
@@ -233,7 +204,7 @@ class Dataset:
             if _GT_REWARD in group:
                 return None
             if SOURCE_REWARD in group:
-                return self._source_reward(group)
+                return self._array(group, SOURCE_REWARD, np.float32)[1:]
             return self._array(group, "rewards", np.float32) if "rewards" in group else None
 
         return self._each(read)
@@ -306,6 +277,9 @@ class Dataset:
                 raise ZestError(f"{name} of dataset {self.id} is damaged ({error}); make it again") from error
         return results
 
+    def _arrays(self, name: str) -> list[FloatArray]:
+        return self._each(lambda group: self._array(group, name, np.float32))
+
     def _array(self, group: h5py.Group, name: str, dtype: type) -> NDArray[Any]:
         if name not in group:
             raise BadInput(
@@ -330,8 +304,28 @@ class Dataset:
             raise BadInput("its actions are discrete, a policy here acts by continuous ones; `zest export` takes them")
         return actions.reshape(len(actions), math.prod(actions.shape[1:])) if actions.ndim > 1 or whole else actions
 
-    def _source_reward(self, group: h5py.Group) -> FloatArray:
-        return self._array(group, SOURCE_REWARD, np.float32)[1:]
+
+def _verified_metadata(dataset_id: str) -> dict[str, Any]:
+    """Return a dataset's metadata after comparing its files with their hashes; raises as `open_dataset`."""
+    folder = dataset_path(dataset_id)
+    if not exists(dataset_id):
+        raise BadInput(
+            f"there is no dataset {dataset_id!r} under the Minari root; {nearest(dataset_id, list_datasets())}. "
+            "Make one with `zest collect`, or set MINARI_DATASETS_PATH to the folder that holds it"
+        )
+    if (folder / MANIFEST_FILE).exists():
+        for name, digest in artifacts.read_json(folder / MANIFEST_FILE).items():
+            path = folder / name
+            if not path.exists() or artifacts.hash_file(path) != digest:
+                raise ZestError(
+                    f"{name} of dataset {dataset_id} is missing or was changed since it was written; make the dataset "
+                    f"again, or, if you changed it on purpose, delete its {MANIFEST_FILE}"
+                )
+    metadata: dict[str, Any] = artifacts.read_json(folder / METADATA_FILE)
+    for key in ("env_spec", "eval_env_spec"):
+        if metadata.get(key):
+            entry_points(metadata[key], f"the {key} of dataset {dataset_id}")
+    return metadata
 
 
 @contextmanager
@@ -345,7 +339,7 @@ def open_dataset(dataset_id: str) -> Iterator[Dataset]:
             episodes are missing.
         ZestError: a file was damaged or changed since it was written.
     """
-    metadata, path = read_metadata(dataset_id), dataset_path(dataset_id)
+    metadata, path = _verified_metadata(dataset_id), dataset_path(dataset_id)
     try:
         file = h5py.File(path / DATA_FILE, "r")
     except OSError as error:
@@ -369,102 +363,3 @@ def _observed(node: h5py.Group | h5py.Dataset) -> Iterator[NDArray[Any]]:
             yield np.asarray(entry[()], dtype=np.float32)
         else:
             yield from stored_rows(entry)
-
-
-# --- by id, opened each time: on their way out -----------------------------------------------------------------------
-
-
-@contextmanager
-def open_episodes(dataset_id: str) -> Iterator[tuple[h5py.File, list[str]]]:
-    """As `open_dataset`."""
-    with open_dataset(dataset_id) as ds:
-        yield ds.groups["episode_0"].file, list(ds.groups)
-
-
-def episode_names(dataset_id: str) -> list[str]:
-    """As `Dataset`."""
-    with open_dataset(dataset_id) as ds:
-        return list(ds.groups)
-
-
-def read_episodes(dataset_id: str, *, discrete: bool = False) -> list[Episode]:
-    """As `Dataset`."""
-    with open_dataset(dataset_id) as ds:
-        return ds.episodes(discrete=discrete)
-
-
-def read_lengths(dataset_id: str) -> list[int]:
-    """As `Dataset`."""
-    with open_dataset(dataset_id) as ds:
-        return ds.n_steps()
-
-
-def read_rewards(dataset_id: str) -> list[FloatArray]:
-    """As `Dataset`."""
-    with open_dataset(dataset_id) as ds:
-        return ds.rewards()
-
-
-def read_states(dataset_id: str) -> list[NDArray[np.float64]]:
-    """As `Dataset`."""
-    with open_dataset(dataset_id) as ds:
-        return ds.states()
-
-
-def has_ground_truth(dataset_id: str) -> bool:
-    """As `Dataset`."""
-    with open_dataset(dataset_id) as ds:
-        return ds.has_truth
-
-
-def read_ground_truth(dataset_id: str) -> list[GroundTruth]:
-    """As `Dataset`."""
-    with open_dataset(dataset_id) as ds:
-        return ds.truth()
-
-
-def read_scores(dataset_id: str) -> list[FloatArray]:
-    """As `Dataset`."""
-    with open_dataset(dataset_id) as ds:
-        return ds.scores()
-
-
-def read_source_rewards(dataset_id: str) -> list[FloatArray] | None:
-    """As `Dataset`."""
-    with open_dataset(dataset_id) as ds:
-        return ds.source_rewards()
-
-
-def rewards_to_keep(dataset_id: str) -> list[FloatArray | None]:
-    """As `Dataset`."""
-    with open_dataset(dataset_id) as ds:
-        return ds.rewards_to_keep()
-
-
-def fingerprint(dataset_id: str) -> str:
-    """As `Dataset`."""
-    with open_dataset(dataset_id) as ds:
-        return ds.fingerprint()
-
-
-def describe(dataset_id: str) -> dict[str, Any]:
-    """As `Dataset`."""
-    with open_dataset(dataset_id) as ds:
-        return ds.describe()
-
-
-def kitchen_task(dataset_id: str) -> str | None:
-    """As `Dataset`."""
-    with open_dataset(dataset_id) as ds:
-        return ds.record.task
-
-
-def task_name(dataset_id: str) -> str:
-    """As `Dataset`."""
-    with open_dataset(dataset_id) as ds:
-        return ds.kitchen_task()
-
-
-def is_foreign(metadata: Mapping[str, Any]) -> bool:
-    """As `DatasetRecord.is_foreign`."""
-    return DatasetRecord.from_metadata("", metadata).is_foreign
