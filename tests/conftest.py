@@ -2,8 +2,10 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -166,6 +168,39 @@ def refusal(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]
         return code, err
 
     return run
+
+
+@pytest.fixture
+def adopt(trained: Path, zest: Callable[..., dict[str, Any]], tmp_path: Path) -> Callable[..., Path]:
+    """Run `zest adopt` on the scored dataset with more flags, and give the run the short horizon."""
+    from zest_rl.runtime import artifacts
+
+    dataset = artifacts.read_json(trained / "bc-0" / "meta.json")["dataset"]
+
+    def run(spec: str, *flags: str | Path) -> Path:
+        if "--run-dir" not in flags:
+            flags = (*flags, "--run-dir", tmp_path / f"run-{artifacts.hash_json(spec)[:6]}")
+        made = Path(zest("adopt", spec, "--dataset", dataset["id"], *flags)["run"])
+        meta = artifacts.read_json(made / "meta.json")
+        meta["dataset"]["env_spec"] = dataset["env_spec"]
+        artifacts.write_json(made / "meta.json", meta)
+        return made
+
+    return run
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Callable[[str], str]:
+    """Write a program that leaves its process id in ``tmp_path / "pid"``, then runs `code`; return its policy spec."""
+
+    def write(code: str) -> str:
+        path = tmp_path / "server.py"
+        path.write_text(
+            f"import os, json, sys, time\nopen({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\n{code}"
+        )
+        return f"command:{shlex.quote(sys.executable)} -I {shlex.quote(str(path))}"
+
+    return write
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,8 @@ from __future__ import annotations
 import json
 import os
 import re
-import shlex
-import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
@@ -27,7 +24,7 @@ from zest_rl.agents import get_agent, load_policy
 from zest_rl.agents.base import DataFacts, autocast
 from zest_rl.agents.foreign import identify
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.evaluation.evaluate import EPISODES_PER_JOB, Evaluation, EvaluationConfig, evaluate, evaluation_folder
+from zest_rl.evaluation.evaluate import EPISODES_PER_JOB, Evaluation, EvaluationConfig, evaluate
 from zest_rl.runtime import artifacts
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit:FutureWarning")  # d3rlpy writes TorchScript
@@ -68,63 +65,10 @@ def save(module: nn.Module, path: Path) -> str:
     return f"torchscript:{path}"
 
 
-def shorten(run: Path, like: Path) -> Path:
-    """Give a run the short horizon of the other's."""
-    meta, other = (artifacts.read_json(folder / "meta.json") for folder in (run, like))
-    meta["dataset"]["env_spec"] = other["dataset"]["env_spec"]
-    artifacts.write_json(run / "meta.json", meta)
-    return run
-
-
-@pytest.fixture
-def adopt(trained: Path, zest: Verb, tmp_path: Path) -> Callable[..., Path]:
-    """Run `zest adopt` on the scored dataset with more flags, and give the run the short horizon."""
-    dataset = artifacts.read_json(trained / "bc-0" / "meta.json")["dataset"]["id"]
-
-    def run(spec: str, *flags: str | Path) -> Path:
-        words = (
-            flags if "--run-dir" in flags else (*flags, "--run-dir", tmp_path / f"run-{artifacts.hash_json(spec)[:6]}")
-        )
-        return shorten(Path(zest("adopt", spec, "--dataset", dataset, *words)["run"]), trained / "bc-0")
-
-    return run
-
-
-@pytest.fixture
-def server(tmp_path: Path) -> Callable[[str], str]:
-    """Write a program that leaves its process id in ``tmp_path / "pid"``, then runs `code`; return its spec."""
-
-    def write(code: str) -> str:
-        path = tmp_path / "server.py"
-        path.write_text(
-            f"import os, json, sys, time\nopen({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\n{code}"
-        )
-        return f"command:{shlex.quote(sys.executable)} -I {shlex.quote(str(path))}"
-
-    return write
-
-
 def documented(language: str, holding: str) -> str:
     blocks = re.findall(rf"```{language}\n(.*?)```", (DOCS / "foreign_policies.md").read_text(), re.DOTALL)
     (block,) = (block for block in blocks if holding in block)
     return str(block)
-
-
-def status(process: Path) -> list[str]:
-    """What the kernel tells of a process after its name: state, parent, group, …; nothing of one that is gone."""
-    try:
-        return (process / "stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return []
-
-
-def is_alive(pid: int) -> bool:
-    return status(Path(f"/proc/{pid}"))[:1] not in ([], ["Z"])
-
-
-def group_of(process: Path) -> int | None:
-    found = status(process)
-    return int(found[2]) if found and found[0] != "Z" else None
 
 
 def assert_same_episodes(one: Evaluation, other: Evaluation) -> None:
@@ -180,28 +124,6 @@ def test_actions_beyond_the_bounds_are_clipped_and_counted(
     assert [list(result.traces["clipped"]) for result in results] == [[SHORT_HORIZON] * 2, [0, 0]]
     words = ("--n-episodes", 2, "--seed", 11, "--n-workers", 1, "--no-videos")
     assert [zest("evaluate", run, *words)["clipped_actions"] for run in (far, edge)] == [1.0, 0.0]
-
-
-def test_every_part_has_a_process_of_its_own_that_is_told_how_many_episodes_begin_and_ends_after_them(
-    adopt: Callable[..., Path], server: Callable[[str], str], tmp_path: Path
-) -> None:
-    log = tmp_path / "log"
-    run = adopt(
-        server(f"""
-seen = []
-for line in sys.stdin:
-    message = json.loads(line)
-    seen.append(message.get("begin", len(message.get("obs", ()))))
-    print(json.dumps({{"ready": 1, "actions": [[0] * 9 for _ in message.get("obs", ())]}}), flush=True)
-print(json.dumps(seen), file=open({str(log)!r}, "a"))
-""")
-    )
-    log.unlink()
-    evaluate(run, EvaluationConfig(n_episodes=EPISODES_PER_JOB + 1), n_workers=1)
-    played = [json.loads(line) for line in log.read_text().splitlines()]
-    dims = {"obs_dim": 59, "act_dim": 9}
-    assert played == [[{"n_episodes": n, **dims}, *[n] * SHORT_HORIZON] for n in (EPISODES_PER_JOB, 1)]
-    assert not is_alive(int((tmp_path / "pid").read_text()))
 
 
 def test_a_torchscript_module_with_a_memory_is_told_that_episodes_begin(
@@ -468,72 +390,6 @@ def test_what_cannot_be_read_is_refused_and_leaves_no_folder(
     assert not [path for path in (tmp_path / "runs").iterdir() if path.suffix != ".lock"]
 
 
-# --- policies that fail -------------------------------------------------------------------------------------------
-
-
-ANSWER = "print(json.dumps({'ready': 1, 'actions': %s}), flush=True)\n"
-LOOP = "for step, line in enumerate(sys.stdin):\n    obs = json.loads(line).get('obs', ())\n    "
-
-
-@pytest.mark.parametrize(
-    ("code", "message"),
-    [
-        ("sys.exit('no weights here')", "ended with exit code 1 instead of answering; its stderr ends with:\nno w"),
-        ("os.kill(os.getpid(), 9)", "ended with exit code -9 instead of answering"),
-        ("os.close(1); time.sleep(600)", "closed its stdout instead of answering"),
-        ("import subprocess; subprocess.Popen(['sleep', '600']); time.sleep(600)", "gave no answer within 5 s and was"),
-        ("print('Loading…', flush=True); sys.stdin.read()", "must answer one line {\"ready\": …} of JSON, got b'Load"),
-        ("print('[]', flush=True); sys.stdin.read()", 'must answer one line {"ready": …} of JSON, got b\'[]'),
-        (LOOP + "print('{\"ready\": 1}', flush=True)", 'must answer one line {"actions": …} of JSON, got b\'{"re'),
-        (LOOP + ANSWER % "[[0] * 8 for _ in obs]", "must give actions of shape (4, 9) for obs (4, 59), got (4, 8)"),
-        (LOOP + ANSWER % "[0] * len(obs)", "must give actions of shape (4, 9) for obs (4, 59), got (4,)"),
-        (LOOP + ANSWER % "[[0] * i for i in range(len(obs))]", "failed on obs of shape (4, 59) (ValueError:"),
-        (LOOP + ANSWER % "[[float('nan')] * 9] + [[0] * 9 for _ in obs[1:]]", "gave NaN or infinity as action of 1 of"),
-        (LOOP + ANSWER % "[[1e999] * 9 for _ in obs]", "gave NaN or infinity as action of 4 of 4 episodes (the first"),
-    ],
-)  # fmt: skip
-def test_a_program_that_does_not_act_is_refused_with_a_reason_and_leaves_nothing(
-    code: str,
-    message: str,
-    collected: str,
-    server: Callable[[str], str],
-    refusal: Callable[..., tuple[int, str]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv("ZEST_POLICY_TIMEOUT", "5" if "sleep'" in code else "60")
-    got, said = refusal(
-        "adopt", server(code), "--dataset", collected, "--name", "mine", "--run-dir", tmp_path / "r" / "x"
-    )
-    assert got == 1
-    assert "policy 'mine' (command)" in said
-    assert message in said
-    assert not (tmp_path / "r" / "x").exists()
-    pid = int((tmp_path / "pid").read_text())
-    assert not is_alive(pid)
-    assert not [other for other in Path("/proc").glob("[0-9]*") if group_of(other) == pid], "what it started is there"
-
-
-def test_a_program_that_dies_in_an_episode_leaves_no_result_and_finished_parts_are_kept(
-    adopt: Callable[..., Path], server: Callable[[str], str], tmp_path: Path
-) -> None:
-    mark = tmp_path / "played"
-    code = f"import pathlib\nmark = pathlib.Path({str(mark)!r})\n" + LOOP
-    code += f"if step == {SHORT_HORIZON} and mark.exists(): sys.exit('out of memory')\n    "
-    run = adopt(server(code + ANSWER % "[[0] * 9 for _ in obs]" + "mark.touch()"))
-    mark.unlink()
-    config = EvaluationConfig(n_episodes=EPISODES_PER_JOB + 1)
-    with pytest.raises(
-        ZestError, match=r"ended with exit code 1 instead of answering; its stderr ends with:\nout of mem"
-    ):
-        evaluate(run, config, n_workers=1)
-    folder = evaluation_folder(run.resolve(), config)
-    assert len(list((folder / "parts").glob("*.npz"))) == 1
-    assert not (folder / "result.json").exists()
-    mark.unlink()
-    assert len(evaluate(run, config, n_workers=1).episodes) == config.n_episodes
-
-
 def test_a_graph_that_takes_other_observations_is_named_in_one_line(
     collected: str, refusal: Callable[..., tuple[int, str]], tmp_path: Path
 ) -> None:
@@ -544,36 +400,3 @@ def test_a_graph_that_takes_other_observations_is_named_in_one_line(
     assert "policy 'p (torchscript)' (torchscript) failed on obs of shape (4, 59) (RuntimeError: " in message
     assert "shapes cannot be multiplied (4x59 and 30x9)" in message
     assert not (tmp_path / "x").exists()
-
-
-def test_a_hanging_program_is_gone_when_zest_is_killed(
-    collected: str, server: Callable[[str], str], tmp_path: Path
-) -> None:
-    spec = server("time.sleep(600)")
-    code = "import sys; from zest_rl.cli import main; sys.exit(main(sys.argv[1:]))"
-    words = ["adopt", spec, "--dataset", collected, "--run-dir", str(tmp_path / "x")]
-    with subprocess.Popen([sys.executable, "-c", code, *words], stderr=subprocess.DEVNULL) as process:
-        while not ((tmp_path / "pid").exists() and (tmp_path / "pid").read_text()):
-            assert process.poll() is None, "it ended before it could be killed"
-            time.sleep(0.05)
-        pid = int((tmp_path / "pid").read_text())
-        assert is_alive(pid)
-        process.send_signal(signal.SIGKILL)
-    end = time.monotonic() + 30
-    while is_alive(pid) and time.monotonic() < end:
-        time.sleep(0.05)
-    assert not is_alive(pid)
-    assert not (tmp_path / "x").exists()
-
-
-def test_a_timeout_that_is_no_number_is_refused(
-    collected: str,
-    server: Callable[[str], str],
-    refusal: Callable[..., tuple[int, str]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv("ZEST_POLICY_TIMEOUT", "long")
-    code, message = refusal("adopt", server(""), "--dataset", collected, "--run-dir", tmp_path / "x")
-    assert code == 2
-    assert "ZEST_POLICY_TIMEOUT must be seconds: could not convert string to float: 'long'" in message

@@ -149,6 +149,15 @@ def test_snapshots_are_the_policies_of_shorter_trainings(whole: Path, tmp_path: 
     assert policy.meta["n_updates"] == 24
 
 
+def test_a_run_and_its_snapshots_carry_the_files_that_they_are_given(tmp_path: Path) -> None:
+    run = start(tmp_path / "run", snapshot_every=12, n_updates=20, files={"scorer": b"goal"})
+    assert [path.relative_to(run).parts[:2] for path in sorted(run.rglob("scorer"))] == [
+        ("scorer",),
+        ("snapshots", "update-000000012"),
+    ]
+    assert (run / "scorer").read_bytes() == b"goal"
+
+
 def test_a_snapshot_that_a_cut_prevented_is_kept_by_the_resumed_run(whole: Path, tmp_path: Path) -> None:
     """At an update with both, the checkpoint is written last: what goes on from it finds the snapshot there."""
     seen: list[tuple[bool, bool]] = []
