@@ -33,10 +33,10 @@ def entries(node: h5py.Group | h5py.Dataset, prefix: str = "") -> dict[str, h5py
     """Return the datasets at or below a node by their paths, sorted; a node that is one itself goes by ""."""
     if isinstance(node, h5py.Dataset):
         return {prefix: node}
-    found: dict[str, h5py.Dataset] = {}
+    below: dict[str, h5py.Dataset] = {}
     for name in sorted(node):
-        found |= entries(node[name], f"{prefix}/{name}" if prefix else name)
-    return found
+        below |= entries(node[name], f"{prefix}/{name}" if prefix else name)
+    return below
 
 
 def n_channels(entry: h5py.Dataset) -> int | None:
@@ -147,11 +147,11 @@ def as_frame(picture: NDArray[Any], what: str) -> Frame:
     return np.ascontiguousarray(np.broadcast_to(picture, (*picture.shape[:2], 3)), dtype=np.uint8)
 
 
-def choose_pictures(found: dict[str, int | None], wanted: Iterable[str], where: str, prefix: str = "") -> list[str]:
+def choose_pictures(channels: dict[str, int | None], wanted: Iterable[str], where: str, prefix: str = "") -> list[str]:
     """Choose the entries whose pictures are the frames: those that are asked for, or the only one.
 
     Args:
-        found: entry → its number of channels, None where it is no picture, 0 where it is one only if it is asked for.
+        channels: entry → their number, None where it is no picture, 0 where it is one only if it is asked for.
         wanted: their names, with or without `prefix`; empty: the only one in colour, else the only one.
         where: names the dataset in an error.
         prefix: what stands before each name for the user, such as ``observations``.
@@ -159,7 +159,7 @@ def choose_pictures(found: dict[str, int | None], wanted: Iterable[str], where: 
     Raises:
         BadInput: no such entry, none at all, or several; the message lists them.
     """
-    shown = {name: "/".join(part for part in (prefix, name) if part) for name, n in found.items() if n is not None}
+    shown = {name: "/".join(part for part in (prefix, name) if part) for name, n in channels.items() if n is not None}
     listing = ", ".join(shown.values()) or "(none)"
     chosen = []
     for key in wanted:
@@ -171,16 +171,16 @@ def choose_pictures(found: dict[str, int | None], wanted: Iterable[str], where: 
         chosen.append(name)
     if chosen:
         return chosen
-    colour = [name for name in shown if found[name] == 3]
-    candidates = colour or [name for name in shown if found[name]]
-    if len(candidates) != 1:
-        several = ", ".join(shown[name] for name in candidates)
-        problem = f"several entries with pictures: {several}" if candidates else "no entry with pictures"
+    colour = [name for name in shown if channels[name] == 3]
+    pictures = colour or [name for name in shown if channels[name]]
+    if len(pictures) != 1:
+        several = ", ".join(shown[name] for name in pictures)
+        problem = f"several entries with pictures: {several}" if pictures else "no entry with pictures"
         raise BadInput(
             f"{where} has {problem}; "
-            + ("choose with --frames KEY, or several keys to average them as views" if candidates else "see --help")
+            + ("choose with --frames KEY, or several keys to average them as views" if pictures else "see --help")
         )
-    return candidates
+    return pictures
 
 
 def stored_rows(entry: h5py.Dataset) -> Iterator[NDArray[Any]]:

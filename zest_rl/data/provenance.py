@@ -1,17 +1,22 @@
 """How a dataset was made: typed records of what its metadata say under "zest", and a run's ``meta.json`` after them.
 
 Up to three stages leave a record: ``collect`` (`CollectRecord`), ``recorded`` (steps per second of an imported dataset)
-and ``relabel`` (`RelabelRecord`). Fields that earlier versions did not write have their defaults.
+and ``relabel`` (`RelabelRecord`). What earlier versions did not write has its default; what later ones add is ignored.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal, Self
 
 from zest_rl.errors import BadInput
+
+
+def _known(record: type[Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values that a record has fields for."""
+    return {each.name: values[each.name] for each in fields(record) if each.name in values}
 
 
 @dataclass(frozen=True)
@@ -33,11 +38,11 @@ class ScorerRecord:
     embedder: str
     features: str
     similarity: str
-    precision: str
-    goal_share: float
-    """Share of the goals that were used."""
     goal_sha256: str
     embedder_sha256: str
+    precision: str = "auto"
+    goal_share: float = 1.0
+    """Share of the goals that were used."""
     views: Mapping[str, Any] | None = None
     """Fields of `zest_rl.kitchen.views.Views`, from which kitchen states were rendered; None for other frames."""
     views_sha256: str | None = None
@@ -46,8 +51,7 @@ class ScorerRecord:
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
         """Read what `to_json` returned."""
-        hashes = {key: value for key, value in values.items() if key != "config"}
-        return cls(**{"precision": "auto", "goal_share": 1.0, **values["config"], **hashes})
+        return cls(**_known(cls, {**values, **values["config"]}))
 
     def to_json(self) -> dict[str, Any]:
         """Config and content hashes, as datasets hold them."""
@@ -87,7 +91,7 @@ class RelabelRecord:
         """Read what `to_json` returned."""
         kept = values.get("kept_goals")
         scorer = ScorerRecord.from_json(values["scorer"])
-        return cls(**{**values, "scorer": scorer, "kept_goals": None if kept is None else tuple(kept)})
+        return cls(**{**_known(cls, values), "scorer": scorer, "kept_goals": None if kept is None else tuple(kept)})
 
     @property
     def is_foreign(self) -> bool:

@@ -69,8 +69,8 @@ def dataset_path(dataset_id: str) -> Path:
 def list_datasets() -> list[str]:
     """Return the ids of all complete datasets under the root, sorted."""
     root = datasets_root()
-    found = (p.parent.parent.relative_to(root).as_posix() for p in root.glob(f"**/{METADATA_FILE}"))
-    return sorted(name for name in found if not any(part.startswith(".") for part in name.split("/")))
+    ids = (p.parent.parent.relative_to(root).as_posix() for p in root.glob(f"**/{METADATA_FILE}"))
+    return sorted(name for name in ids if not any(part.startswith(".") for part in name.split("/")))
 
 
 def exists(dataset_id: str) -> bool:

@@ -233,7 +233,7 @@ class Trajectories(Protocol):
     def fingerprint(self) -> str:
         """64 hex digits over all that training may see of them, but no rewards."""
 
-    def source_rewards(self) -> Sequence[FloatArray | None]:
+    def rewards_to_keep(self) -> Sequence[FloatArray | None]:
         """Rewards (T,) of every episode to keep beside the new ones; None, or all NaN: there are none to keep."""
 
     def fill(self, folder: Path) -> None:
@@ -272,7 +272,7 @@ class DatasetCopy:
         """See `zest_rl.data.reader.Dataset.fingerprint`."""
         return self.sha256
 
-    def source_rewards(self) -> Sequence[FloatArray | None]:
+    def rewards_to_keep(self) -> Sequence[FloatArray | None]:
         """See `zest_rl.data.reader.Dataset.rewards_to_keep`."""
         return self.rewards
 
@@ -348,7 +348,7 @@ def write_scored(
             raise BadInput(f"dataset {dataset_id} exists already; choose another name or delete {final}")
         artifacts.check_free_space(final.parent, 2 * trajectories.n_bytes)
         with artifacts.staged_folder(final) as staging:
-            scored = [_scored(*new) for new in zip(rewards, scores, trajectories.source_rewards(), strict=True)]
+            scored = [_scored(*new) for new in zip(rewards, scores, trajectories.rewards_to_keep(), strict=True)]
             _in_child(_build_scored, trajectories, staging, scored)
             metadata = artifacts.read_json(staging / METADATA_FILE)
             _set_metadata(

@@ -155,9 +155,9 @@ def _width(values: NDArray[Any]) -> int:
 def _stats(values: NDArray[Any]) -> dict[str, list[Any]]:
     """Statistics per dimension, over exact quantiles (LeRobot's own are of histograms)."""
     each = values.reshape(len(values), -1).astype(np.float64)
-    found = {"min": each.min(0), "max": each.max(0), "mean": each.mean(0), "std": each.std(0)}
-    found |= {name: np.quantile(each, share, axis=0) for name, share in QUANTILES.items()}
-    return {name: list(map(float, numbers)) for name, numbers in found.items()} | {"count": [len(each)]}
+    stats = {"min": each.min(0), "max": each.max(0), "mean": each.mean(0), "std": each.std(0)}
+    stats |= {name: np.quantile(each, share, axis=0) for name, share in QUANTILES.items()}
+    return {name: list(map(float, numbers)) for name, numbers in stats.items()} | {"count": [len(each)]}
 
 
 def _pyarrow() -> Any:
@@ -181,7 +181,7 @@ def _table(columns: Columns) -> pa.Table:
 
 
 def _episodes(columns: Columns, rows: list[slice], task: str) -> pa.Table:
-    found: dict[str, list[Any]] = {
+    table: dict[str, list[Any]] = {
         "episode_index": list(range(len(rows))),
         "tasks": [[task]] * len(rows),
         "length": [row.stop - row.start for row in rows],
@@ -189,11 +189,11 @@ def _episodes(columns: Columns, rows: list[slice], task: str) -> pa.Table:
         "dataset_to_index": [row.stop for row in rows],
     }
     for place in ("data/chunk_index", "data/file_index", "meta/episodes/chunk_index", "meta/episodes/file_index"):
-        found[place] = [0] * len(rows)
+        table[place] = [0] * len(rows)
     for name, values in columns.items():
         each = [_stats(values[row]) for row in rows]
-        found |= {f"stats/{name}/{which}": [stats[which] for stats in each] for which in each[0]}
-    return _pyarrow().table(found)
+        table |= {f"stats/{name}/{which}": [stats[which] for stats in each] for which in each[0]}
+    return _pyarrow().table(table)
 
 
 def _tasks(task: str) -> pa.Table:

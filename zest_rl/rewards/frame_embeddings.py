@@ -105,7 +105,7 @@ class FrameEmbeddings:
 
     def identity(self) -> list[Any]:
         """The rewards that the dataset came with, which a copy keeps, and the frames."""
-        rewards = self._source.trajectories.source_rewards()
+        rewards = self._source.trajectories.rewards_to_keep()
         return [[None if r is None else artifacts.hash_arrays(r) for r in rewards], self._digests]
 
     def describe(self) -> dict[str, Any]:

@@ -69,7 +69,7 @@ class Rows:
         """Hash observations, actions and ends, and the frame rate, which the copy keeps."""
         return artifacts.hash_json([imported.fingerprint(self.episodes()), self.fps])
 
-    def source_rewards(self) -> Sequence[FloatArray | None]:
+    def rewards_to_keep(self) -> Sequence[FloatArray | None]:
         """Read the rewards that the episodes came with."""
         return [episode.rewards for episode in self.episodes()]
 

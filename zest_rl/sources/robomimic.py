@@ -45,7 +45,7 @@ class Demos:
         """Hash observations, actions and ends."""
         return imported.fingerprint(self.episodes())
 
-    def source_rewards(self) -> Sequence[FloatArray | None]:
+    def rewards_to_keep(self) -> Sequence[FloatArray | None]:
         """Read the rewards that the episodes came with."""
         return [episode.rewards for episode in self.episodes()]
 

@@ -1,0 +1,79 @@
+"""Records of how datasets were made: what is written today is read unchanged, and what was written before is read."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from zest_rl.data.provenance import CollectRecord, DatasetRecord, RelabelRecord
+from zest_rl.errors import BadInput
+
+SCORER = {
+    "config": {
+        "views": {"task": "micro", "n_views": 8, "size": 224, "robot": False, "tolerance": 0.001},
+        "goal": "same-scene", "embedder": "efficientnet-lite0", "features": "delta", "similarity": "cos",
+        "precision": "auto", "goal_share": 0.5,
+    },
+    "goal_sha256": "1" * 64, "embedder_sha256": "2" * 64, "views_sha256": "3" * 64,
+}  # fmt: skip
+KITCHEN: dict[str, Any] = {
+    "source": "zest/kitchen-micro-noisy-v0", "source_sha256": "4" * 64, "reward": "level", "shuffle": None,
+    "kept_goals": [0, 2], "scorer": SCORER, "n_still_frames": 7, "provenance": {"command": "zest relabel"},
+}  # fmt: skip
+PICTURES: dict[str, Any] = {
+    "source": "room/some-v0", "source_sha256": "4" * 64,
+    "frames": {"kind": "pictures", "views": ["observations/left", "observations/right"]}, "frames_sha256": "5" * 64,
+    "reward": "difference", "shuffle": 3, "kept_goals": None,
+    "scorer": {
+        "config": {key: value for key, value in SCORER["config"].items() if key != "views"},  # type: ignore[union-attr]
+        "goal_sha256": "1" * 64, "embedder_sha256": "2" * 64,
+    },
+    "n_still_frames": 0, "provenance": {"command": "zest relabel"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("values", [KITCHEN, PICTURES], ids=["kitchen", "pictures"])
+@pytest.mark.parametrize("of_run", [False, True])
+def test_a_record_becomes_the_json_that_it_was_read_from(values: dict[str, Any], of_run: bool) -> None:
+    told = {key: value for key, value in values.items() if not of_run or key != "provenance"}
+    assert json.dumps(RelabelRecord.from_json(told).to_json()) == json.dumps(told)
+
+
+def test_frames_that_are_not_rendered_from_kitchen_states_are_foreign() -> None:
+    kitchen, pictures = RelabelRecord.from_json(KITCHEN), RelabelRecord.from_json(PICTURES)
+    assert (kitchen.is_foreign, kitchen.n_views, kitchen.kept_goals) == (False, 8, (0, 2))
+    assert (pictures.is_foreign, pictures.n_views, pictures.scorer.views) == (True, 2, None)
+    assert DatasetRecord.from_metadata("room/some-v0", {"zest": {"relabel": PICTURES}}).is_foreign
+    assert not DatasetRecord.from_metadata("room/some-v0", {}).is_foreign
+
+
+def test_what_earlier_versions_did_not_record_has_its_default_and_what_later_ones_do_is_ignored() -> None:
+    config = {key: value for key, value in SCORER["config"].items() if key != "goal_share"}  # type: ignore[union-attr]
+    before = {key: KITCHEN[key] for key in ("source", "source_sha256", "reward")} | {
+        "scorer": {**SCORER, "config": config}
+    }
+    record = RelabelRecord.from_json(before)
+    assert (record.shuffle, record.kept_goals, record.n_still_frames) == (None, None, None)
+    assert record.scorer.goal_share == 1
+    assert RelabelRecord.from_json({**KITCHEN, "unheard_of": 1}) == RelabelRecord.from_json(KITCHEN)
+
+
+def test_a_run_s_description_and_a_dataset_s_metadata_are_read_alike() -> None:
+    spec = {"id": "zest/Kitchen-v1", "entry_point": "zest_rl.envs:KitchenEnv", "kwargs": {"task": "micro"}}
+    collect = {"asked": {"task": "micro"}, "result": {"n_failed": 1}, "provenance": {"command": "zest collect"}}
+    metadata = {
+        "env_spec": json.dumps(spec), "ref_min_score": 0.0, "ref_max_score": 70.0, "total_episodes": 3,
+        "zest": {"collect": collect, "recorded": {"fps": 10}, "relabel": KITCHEN},
+    }  # fmt: skip
+    record = DatasetRecord.from_metadata("zest/x-v0", metadata)
+    assert (record.task, record.env["id"], record.fps) == ("micro", "zest/Kitchen-v1", 10)
+    assert record.collect == CollectRecord({"task": "micro"}, {"n_failed": 1})
+    assert DatasetRecord.from_description({"id": "zest/x-v0", "sha256": "6" * 64, **metadata}) == record
+
+
+@pytest.mark.parametrize("relabel", [{"a": 1}, {**KITCHEN, "scorer": {}}, {**KITCHEN, "scorer": 1}, [1], "x"])
+def test_a_record_of_another_program_is_named_with_its_dataset(relabel: Any) -> None:
+    with pytest.raises(BadInput, match="the record of how zest/x-v0 was made is not ours"):
+        DatasetRecord.from_metadata("zest/x-v0", {"zest": {"relabel": relabel}})
