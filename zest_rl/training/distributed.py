@@ -1,4 +1,4 @@
-"""Several processes, one training: those that ``torchrun`` starts share every batch and average their gradients.
+"""Several processes, one training: the processes of ``torchrun`` share every batch and average their gradients.
 
 All of them draw the same batch and keep a share of its rows each, so that a training means the same however many
 processes it has: the batch size is that of all of them, and where nothing is random but the batches (no dropout), the
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from zest_rl.errors import BadInput, ZestError
 
-if TYPE_CHECKING:  # the command line asks `launched` before it imports what is heavy
+if TYPE_CHECKING:  # the command line calls `launched` before it imports heavy packages
     import torch
     from torch import Tensor
 
@@ -33,7 +33,7 @@ class Group:
 
     @property
     def leads(self) -> bool:
-        """Whether this is the one process that writes files and talks."""
+        """Whether this is the process that writes files and reports progress."""
         return self.rank == 0
 
     def share(self, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], float]:

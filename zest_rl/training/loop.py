@@ -46,7 +46,7 @@ from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint, snapshot_folder
 from zest_rl.training.distributed import Group, joined, launched, local_index
-from zest_rl.training.log import COLUMNS, MetricsLog
+from zest_rl.training.log import MetricsLog
 from zest_rl.types import Episode
 
 RESULT_KEYS = ("n_params", "model_sha256", "train_seconds", "made_by")  # keys of meta.json that only the end knows
@@ -86,7 +86,7 @@ class OnProgress(Protocol):
     """Called after every logged row."""
 
     def __call__(self, n: int, **fields: float) -> None:
-        """Take the number of updates since the last call (at first, since update 0), and the row by `COLUMNS`."""
+        """Take the number of updates since the last call (at first, since update 0), and the row: loss and others."""
 
 
 def fit(
@@ -190,12 +190,15 @@ def fit(
                 now = time.perf_counter()
                 state.seconds, tick = state.seconds + now - tick, now
                 # log
-                ends = state.update == config.n_updates
-                if state.update % config.log_every == 0 or ends:
+                is_last = state.update == config.n_updates
+                if state.update % config.log_every == 0 or is_last:
                     losses, norms = np.mean(state.recent, axis=0)
-                    speed = (state.update - row_update) / (now - row_tick)
-                    values = (float(losses), float(norms), learning_rate, round(speed, 2))
-                    row = dict(zip(COLUMNS, values, strict=True))
+                    row = {
+                        "loss": float(losses),
+                        "grad_norm": float(norms),
+                        "learning_rate": learning_rate,
+                        "updates_per_s": round((state.update - row_update) / (now - row_tick), 2),
+                    }
                     state.recent, row_update, row_tick = [], state.update, now
                     if log is not None:
                         log.write(state.update, row)
@@ -206,7 +209,7 @@ def fit(
                 at_checkpoint = state.update % config.checkpoint_every == 0
                 if at_checkpoint:
                     _reseed_others(config.seed, group, state.update)
-                if group.leads and not ends:
+                if group.leads and not is_last:
                     # before the checkpoint: a run that goes on from there does not come by here again
                     if config.snapshot_every is not None and state.update % config.snapshot_every == 0:
                         _write_snapshot(run_dir, state, described, files)
