@@ -40,7 +40,7 @@ from zest_rl.rewards.scores import score_views
 from zest_rl.runtime.gl import select_gl_backend
 from zest_rl.sources import open_source
 from zest_rl.sources.pictures import Pictures
-from zest_rl.sources.states import stage_of
+from zest_rl.sources.stage import stage_of
 from zest_rl.types import FloatArray, Frame
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari")  # datasets of tests have no author

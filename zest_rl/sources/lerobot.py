@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from zest_rl.data.observations import choose_pictures
 from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
-from zest_rl.sources import imported
-from zest_rl.sources.imported import Imported
+from zest_rl.sources import conversion
+from zest_rl.sources.conversion import ConvertedEpisode
 from zest_rl.types import FloatArray, Frame
 
 INFO = Path("meta", "info.json")
@@ -58,7 +58,7 @@ class Rows:
     @property
     def dataset_id(self) -> str:
         """Made of the folder's name."""
-        return imported.dataset_id_of(self.root)
+        return conversion.dataset_id_of(self.root)
 
     @property
     def n_bytes(self) -> int:
@@ -67,7 +67,7 @@ class Rows:
 
     def fingerprint(self) -> str:
         """Hash observations, actions and ends, and the frame rate, which the copy keeps."""
-        return artifacts.hash_json([imported.fingerprint(self.episodes()), self.fps])
+        return artifacts.hash_json([conversion.fingerprint(self.episodes()), self.fps])
 
     def rewards_to_keep(self) -> Sequence[FloatArray | None]:
         """Read the rewards that the episodes came with."""
@@ -76,13 +76,13 @@ class Rows:
     def fill(self, folder: Path) -> None:
         """Write them as a Minari dataset."""
         description = f"Imported from {self.root.name} (LeRobot)."
-        imported.fill(folder, self.dataset_id, self.episodes(), description, fps=self.fps)
+        conversion.fill(folder, self.dataset_id, self.episodes(), description, fps=self.fps)
 
     def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
         """Yield what is written of each episode."""
-        return map(imported.stored, self.episodes())
+        return map(conversion.stored, self.episodes())
 
-    def episodes(self) -> Iterator[Imported]:
+    def episodes(self) -> Iterator[ConvertedEpisode]:
         """Read one file at a time, which LeRobot keeps at 100 MB."""
         import pyarrow.compute
         import pyarrow.parquet
@@ -100,14 +100,14 @@ class Rows:
                     )
                 yield self._episode({name: _column(rows[name]) for name in (*self.observed, *self.others)})
 
-    def _episode(self, columns: Mapping[str, FloatArray]) -> Imported:
+    def _episode(self, columns: Mapping[str, FloatArray]) -> ConvertedEpisode:
         obs = {name: np.concatenate([columns[name], columns[name][-1:]]) for name in self.observed}
         n_steps = len(columns["action"])
         rewards = columns.get("next.reward", np.full((n_steps, 1), np.nan, np.float32))[:, 0]
         done, truncated = (columns.get(f"next.{end}") for end in ("done", "truncated"))
         terminated = done is not None and truncated is not None and bool(done[-1, 0] and not truncated[-1, 0])
         success = columns["next.success"][:, 0] > 0 if "next.success" in columns else None
-        return Imported(obs, columns["action"], rewards, terminated, success)
+        return ConvertedEpisode(obs, columns["action"], rewards, terminated, success)
 
 
 def _column(values: Any) -> FloatArray:

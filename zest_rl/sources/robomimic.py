@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from zest_rl.data.observations import choose_pictures, entries, is_numbers
 from zest_rl.errors import BadInput
-from zest_rl.sources import imported
-from zest_rl.sources.imported import Imported
+from zest_rl.sources import conversion
+from zest_rl.sources.conversion import ConvertedEpisode
 from zest_rl.sources.pictures import Pictures, picture_entries
 from zest_rl.types import FloatArray
 
@@ -39,11 +39,11 @@ class Demos:
     @property
     def dataset_id(self) -> str:
         """Made of the file's name."""
-        return imported.dataset_id_of(self.file)
+        return conversion.dataset_id_of(self.file)
 
     def fingerprint(self) -> str:
         """Hash observations, actions and ends."""
-        return imported.fingerprint(self.episodes())
+        return conversion.fingerprint(self.episodes())
 
     def rewards_to_keep(self) -> Sequence[FloatArray | None]:
         """Read the rewards that the episodes came with."""
@@ -51,20 +51,20 @@ class Demos:
 
     def fill(self, folder: Path) -> None:
         """Write them as a Minari dataset."""
-        imported.fill(folder, self.dataset_id, self.episodes(), f"Imported from {self.file.name} (robomimic).")
+        conversion.fill(folder, self.dataset_id, self.episodes(), f"Imported from {self.file.name} (robomimic).")
 
     def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
         """Yield what is written of each episode."""
-        return map(imported.stored, self.episodes())
+        return map(conversion.stored, self.episodes())
 
-    def episodes(self) -> Iterator[Imported]:
+    def episodes(self) -> Iterator[ConvertedEpisode]:
         """Read one episode at a time."""
         with h5py.File(self.file, "r") as file:
             for name in self.names:
                 yield _read(file[name])
 
 
-def _read(demo: h5py.Group) -> Imported:
+def _read(demo: h5py.Group) -> ConvertedEpisode:
     actions = np.asarray(demo["actions"][()], np.float32)
     rewards = np.asarray(demo["rewards"][()], np.float32) if "rewards" in demo else np.full(len(actions), np.nan, "f4")
     obs = {}
@@ -76,7 +76,7 @@ def _read(demo: h5py.Group) -> Imported:
             obs[path.replace("/", ".")] = np.concatenate([rows, last])
     ends = next((np.asarray(demo[name][()]) for name in ("terminals", "dones") if name in demo), np.zeros(1))
     try:
-        return Imported(obs, actions, rewards, bool(len(ends) and ends[-1]))
+        return ConvertedEpisode(obs, actions, rewards, bool(len(ends) and ends[-1]))
     except BadInput as error:
         raise BadInput(f"{demo.name}: {error}") from error
 

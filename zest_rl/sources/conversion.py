@@ -19,7 +19,7 @@ from zest_rl.types import FloatArray
 
 
 @dataclass(frozen=True)
-class Imported:
+class ConvertedEpisode:
     """One episode of T steps."""
 
     obs: dict[str, FloatArray]
@@ -51,7 +51,7 @@ def dataset_id_of(path: Path) -> str:
     return f"zest/{name or 'dataset'}-v0"
 
 
-def fingerprint(episodes: Iterable[Imported]) -> str:
+def fingerprint(episodes: Iterable[ConvertedEpisode]) -> str:
     """Hash all that training may see of the episodes, and success where it is kept, but no rewards."""
     return artifacts.hash_json(
         [
@@ -66,7 +66,7 @@ def fingerprint(episodes: Iterable[Imported]) -> str:
     )
 
 
-def stored(episode: Imported) -> dict[str, NDArray[Any]]:
+def stored(episode: ConvertedEpisode) -> dict[str, NDArray[Any]]:
     """Return what `fill` writes of an episode but its rewards, under the names on disk."""
     last = np.arange(len(episode.actions)) == len(episode.actions) - 1
     success = {} if episode.success is None else {SOURCE_SUCCESS: np.concatenate([[False], episode.success])}
@@ -80,7 +80,7 @@ def stored(episode: Imported) -> dict[str, NDArray[Any]]:
 
 
 def fill(
-    folder: Path, dataset_id: str, episodes: Iterable[Imported], description: str, *, fps: float | None = None
+    folder: Path, dataset_id: str, episodes: Iterable[ConvertedEpisode], description: str, *, fps: float | None = None
 ) -> None:
     """Write the files of a Minari dataset, see `zest_rl.data.writer.Trajectories`; `fps` are steps per second."""
     import minari

@@ -1,0 +1,142 @@
+"""An environment of another package, made to draw states that it once had: its model, and cameras that look at it.
+
+A frame is drawn as the kitchen's are: no shadows, reflections, multisampling or sky. Only registered environments are
+made, without their wrappers.
+"""
+
+from __future__ import annotations
+
+import atexit
+import functools
+from contextlib import redirect_stderr
+from io import StringIO
+from typing import Any
+
+import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
+import gymnasium
+import mujoco
+import numpy as np
+
+from zest_rl.data.env_specs import check_registered
+from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.runtime import artifacts
+from zest_rl.simulation.rendering import Canvas
+from zest_rl.sources import state_plugins
+from zest_rl.sources.recorded_envs import State, recorded_env
+from zest_rl.types import Frame
+
+SIZE = 224
+"""Side of the square frames, in pixels."""
+Pose = tuple[tuple[float, float, float], float, float, float]
+"""Point that a camera looks at and distance from it in metres, azimuth and elevation in degrees."""
+
+
+class Stage:
+    """One environment, and cameras that look at its model."""
+
+    def __init__(self, env: Any, entry_point: str, cameras: tuple[str, ...]) -> None:
+        """Open a GL context; see `stage_of`."""
+        self.env, self.model, self.data = env, env.model, env.data
+        compiled = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
+        mujoco.mj_saveModel(self.model, None, compiled)
+        self.model_sha256 = artifacts.hash_arrays(compiled)
+        visual = self.model.vis
+        visual.global_.offwidth = visual.global_.offheight = SIZE
+        visual.quality.shadowsize = visual.quality.offsamples = 0
+        self._recorded = recorded_env(entry_point)
+        self.scenery = self._recorded.scenery(env)
+        """Paths of what `render` takes besides qpos, see `RecordedEnv`."""
+        if self._recorded.put is None and hasattr(env, "_render_callback"):
+            raise BadInput(
+                f"{entry_point} places targets only while it renders, in a way that is not known here; give --frames "
+                "FOLDER with a video of each episode"
+            )
+        self._renderer = _renderer_of(env)
+        self._default = mujoco.MjvCamera()
+        fixed = getattr(self._renderer, "camera_id", -1)
+        self.is_fixed = fixed >= 0
+        """Whether the environment was made with a camera of the model as its default."""
+        if self.is_fixed:
+            self._default.type, self._default.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, fixed
+        views = tuple(_camera(self.model, name) for name in cameras) or (self._default,)
+        self._canvas = Canvas(self.model, views, SIZE)
+        self._canvas.hide_sky()
+
+    def default_pose(self, state: State) -> Pose:
+        """Return where the camera of ``env.render()`` stands if this state is the first that it shows.
+
+        As Gymnasium's `OffScreenViewer` and `MujocoRenderer` place it: it stays there, whatever moves.
+        """
+        self._put(state)
+        camera = mujoco.MjvCamera()
+        x, y, z = np.median(self.data.geom_xpos, axis=0).tolist()
+        settings = getattr(self._renderer, "default_cam_config", None) or {}
+        camera.lookat, camera.distance = settings.get("lookat", (x, y, z)), self.model.stat.extent
+        for field in ("distance", "azimuth", "elevation"):
+            if field in settings:
+                setattr(camera, field, settings[field])
+        x, y, z = camera.lookat.tolist()
+        return (x, y, z), camera.distance, camera.azimuth, camera.elevation
+
+    def render(self, state: State, pose: Pose | None = None) -> list[Frame]:
+        """Draw one state: one (H, W, 3) frame per camera; `pose` is of the environment's default camera."""
+        self._put(state)
+        if pose is not None:
+            self._default.lookat, self._default.distance, self._default.azimuth, self._default.elevation = pose
+        return list(self._canvas.draw(self.data))
+
+    def _put(self, state: State) -> None:
+        self._recorded.put_state(self.env, state)
+        mujoco.mj_fwdPosition(self.model, self.data)
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self._canvas.close()
+
+
+@functools.cache
+def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
+    """Return this process's stage, open until the process ends.
+
+    Raises:
+        BadInput: not an EnvSpec, not a registered environment, or one without a MuJoCo model or such a camera.
+        ZestError: the environment cannot be made with the packages here, or no GL backend works.
+    """
+    try:
+        spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
+    except (ValueError, KeyError, TypeError) as error:
+        raise BadInput(f"the dataset's env_spec is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
+    plugin = state_plugins.registered(spec.id)
+    if plugin is not None and spec.id not in gymnasium.registry:
+        state_plugins.load(plugin)  # its module registers the environment
+    check_registered(spec)
+    spec.additional_wrappers = ()  # what they change is not shown, and they are code
+    try:
+        with redirect_stderr(StringIO()):  # on import gymnasium_robotics prints news of its other environments
+            env: Any = gymnasium.make(spec, disable_env_checker=True).unwrapped
+    except Exception as error:  # whatever an environment raises
+        raise ZestError(
+            f"{spec.id} cannot be made here ({type(error).__name__}: {error}); install what it needs, or give --frames "
+            "FOLDER with a video of each episode"
+        ) from error
+    if not isinstance(getattr(env, "model", None), mujoco.MjModel):
+        raise BadInput(f"{spec.id} has no MuJoCo model to render; give --frames FOLDER with a video of each episode")
+    stage = Stage(env, str(spec.entry_point), cameras)
+    atexit.register(stage.close)
+    return stage
+
+
+def _renderer_of(env: Any) -> Any:
+    """Return Gymnasium's renderer of an environment, or of the one that it is built on; None: it has none."""
+    inner = (getattr(env, part, None) for part in ("point_env", "ant_env", "robot_env"))
+    renderers = (getattr(part, "mujoco_renderer", None) for part in (env, *inner))
+    return next((renderer for renderer in renderers if renderer is not None), None)
+
+
+def _camera(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:
+    """Return a camera of the model."""
+    camera, names = mujoco.MjvCamera(), [model.camera(i).name for i in range(model.ncam)]
+    if name not in names:
+        raise BadInput(f"the model has no camera {name!r}; {nearest(name, names)}")
+    camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, names.index(name)
+    return camera
