@@ -20,8 +20,8 @@ import numpy as np
 
 from zest_rl.agents import AGENTS, load_policy
 from zest_rl.evaluation.evaluate import EvaluationConfig, evaluate, target_return
-from zest_rl.kitchen.collect import Behaviour, env_spec, rollout
-from zest_rl.kitchen.env import HORIZON
+from zest_rl.kitchen.behaviour import Behaviour, rollout
+from zest_rl.kitchen.env import HORIZON, env_spec
 from zest_rl.runtime.parallel import n_cores, one_thread
 from zest_rl.training.loop import TrainingConfig, fit
 from zest_rl.types import Episode

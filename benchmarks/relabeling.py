@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from zest_rl.data.reader import open_dataset
 from zest_rl.data.writer import write_dataset
-from zest_rl.kitchen import collect
+from zest_rl.kitchen.behaviour import Behaviour, recordings, rollout
+from zest_rl.kitchen.env import env_spec
 from zest_rl.kitchen.views import Views, distinct_states
 from zest_rl.rewards import state_embeddings
 from zest_rl.rewards.relabel import relabel_source
@@ -95,8 +96,8 @@ def relabel_ms(episodes: dict[str, NDArray[Any]]) -> tuple[float, float]:
     """Return cpu-ms per frame and view, and cpu-ms per *distinct* state and view."""
     write_dataset(
         DATASET,
-        collect.recordings(episodes),
-        env_spec=collect.env_spec("micro").to_json(),
+        recordings(episodes),
+        env_spec=env_spec("micro").to_json(),
         ref_min_score=0.0,
         ref_max_score=70.0,
         algorithm_name="scripted expert with uniform action noise",
@@ -145,13 +146,13 @@ def rescoring_seconds(config: ScorerConfig, episodes: list[NDArray[np.float64]])
 
 def run() -> dict[str, object]:
     """Return cpu-ms per frame and view of both loops, cpu-s of scoring again, and whether both requirements are met."""
-    behaviour = collect.Behaviour("micro", "expert", noise_max=1.0)
+    behaviour = Behaviour("micro", "expert", noise_max=1.0)
     before = {name: os.environ.get(name) for name in ("MINARI_DATASETS_PATH", "ZEST_CACHE")}
     with tempfile.TemporaryDirectory() as folder, one_thread():
         os.environ.update(MINARI_DATASETS_PATH=str(Path(folder, "minari")), ZEST_CACHE=str(Path(folder, "cache")))
         try:
             plain = plain_ms()
-            episodes = concatenate([collect.rollout(behaviour, index) for index in range(N_RESCORED)])
+            episodes = concatenate([rollout(behaviour, index) for index in range(N_RESCORED)])
             ours, per_state = relabel_ms({name: array[:N_RELABELED] for name, array in episodes.items()})
             states = list(episodes["qpos"])
             n_distinct = fill_cache(np.concatenate(states[:N_RELABELED]), np.concatenate(states))

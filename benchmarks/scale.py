@@ -37,11 +37,11 @@ SMALL = "test_vit"
 
 def make_frames() -> np.ndarray:
     """Render (N, SIDE, SIDE, 3) uint8 of two episodes of the kitchen from several sides, more than an episode shows."""
-    from zest_rl.kitchen import collect
+    from zest_rl.kitchen.behaviour import Behaviour, rollout
     from zest_rl.kitchen.views import Views
 
-    behaviour = collect.Behaviour("micro", "expert")
-    states = np.concatenate([collect.rollout(behaviour, index)["qpos"].reshape(101, -1) for index in range(2)])
+    behaviour = Behaviour("micro", "expert")
+    states = np.concatenate([rollout(behaviour, index)["qpos"].reshape(101, -1) for index in range(2)])
     renderer = Views("micro", n_views=8, size=SIDE, robot=True).shared_renderer()
     return np.concatenate([renderer.render(state) for state in states])
 

@@ -39,15 +39,16 @@ COLLECTED = "zest/kitchen-micro-tiny-v0"
 def collect_some(dataset_id: str, task: str, n_episodes: int) -> None:
     """Leave a few noisy episodes of the expert in the Minari root."""
     from zest_rl.data.writer import write_dataset
-    from zest_rl.kitchen import collect
+    from zest_rl.kitchen.behaviour import Behaviour, recordings, rollout
+    from zest_rl.kitchen.env import env_spec
     from zest_rl.runtime.arrays import concatenate
 
-    behaviour = collect.Behaviour(task, "expert", noise_max=1.0)
-    episodes = concatenate([collect.rollout(behaviour, index) for index in range(n_episodes)])
+    behaviour = Behaviour(task, "expert", noise_max=1.0)
+    episodes = concatenate([rollout(behaviour, index) for index in range(n_episodes)])
     write_dataset(
         dataset_id,
-        collect.recordings(episodes),
-        env_spec=collect.env_spec(task).to_json(),
+        recordings(episodes),
+        env_spec=env_spec(task).to_json(),
         ref_min_score=0.0,
         ref_max_score=70.0,
         algorithm_name="scripted expert with uniform action noise",

@@ -22,7 +22,7 @@ from zest_rl import cli
 from zest_rl.cli import reproduce
 from zest_rl.cli.reproduce.plan import TaskData, plan_cells, read_plan
 from zest_rl.data import reader
-from zest_rl.kitchen import collect
+from zest_rl.kitchen import calibration
 from zest_rl.report import methods
 from zest_rl.runtime import artifacts
 
@@ -94,8 +94,8 @@ def places(short_videos: None, tmp_path_factory: pytest.TempPathFactory) -> Iter
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
         patch.setenv("ZEST_CACHE", str(folder / "cache"))
-        patch.setattr(collect, "N_REFERENCE", 2)
-        patch.setattr(collect, "N_NOTHING", 1)
+        patch.setattr(calibration, "N_REFERENCE", 2)
+        patch.setattr(calibration, "N_NOTHING", 1)
         yield folder
 
 
@@ -414,9 +414,9 @@ def test_a_reproduction_killed_in_training_goes_on_and_ends_with_the_same_bits(
     recipe = write(tmp_path, RECIPE.replace("n_updates = 20", "n_updates = 600\ncheckpoint_every = 100"))
     cut = tmp_path / "cut"
     code = (
-        "import sys; from zest_rl import cli, collect\n"
+        "import sys; from zest_rl import cli; from zest_rl.kitchen import calibration\n"
         "if __name__ == '__main__':\n"
-        "    collect.N_REFERENCE, collect.N_NOTHING = 2, 1\n"
+        "    calibration.N_REFERENCE, calibration.N_NOTHING = 2, 1\n"
         "    sys.exit(cli.main(sys.argv[1:]))\n"
     )
     script = tmp_path / "script.py"

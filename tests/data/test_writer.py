@@ -20,7 +20,7 @@ from zest_rl.data import reader
 from zest_rl.data.reader import Dataset
 from zest_rl.data.writer import DatasetCopy, Recording, write_dataset, write_scored
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.kitchen import collect
+from zest_rl.kitchen.env import env_spec
 from zest_rl.runtime import artifacts
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 NEW = "zest/kitchen-micro-new-v0"
 WRITE_FAILED = r"could not be written: the (disk is full|writing process died).*; nothing was left behind"
 N_OBS, N_QPOS, N_QVEL, N_ACTIONS = 59, 30, 29, 9
-ENV_SPEC = collect.env_spec("micro").to_json()
+ENV_SPEC = env_spec("micro").to_json()
 
 
 def random_recordings(n_episodes: int, seed: int = 0, n_steps: int = 100) -> list[Recording]:

@@ -31,8 +31,7 @@ from zest_rl.evaluation.evaluate import (
     target_return,
 )
 from zest_rl.evaluation.rollout import Arrays, run_episodes
-from zest_rl.kitchen.collect import env_spec
-from zest_rl.kitchen.env import ENV_ID, HORIZON, KitchenEnv
+from zest_rl.kitchen.env import ENV_ID, HORIZON, KitchenEnv, env_spec
 from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
@@ -75,7 +74,7 @@ class Replay:
 @pytest.fixture
 def replay(trained: Path) -> Callable[..., tuple[Replay, Arrays]]:
     """Roll out the policy of a run along the first recorded episode, in which the microwave opens."""
-    seed = int(np.random.SeedSequence([0, 0]).generate_state(2)[0])  # as `zest_rl.kitchen.collect.rollout` draws it
+    seed = int(np.random.SeedSequence([0, 0]).generate_state(2)[0])  # as `zest_rl.kitchen.behaviour.rollout` draws it
     actions = read(COLLECTED, Dataset.episodes)[0].actions
 
     def play(name: str, config: EvaluationConfig = ONLINE, scorer: StateScorer | None = None) -> tuple[Replay, Arrays]:

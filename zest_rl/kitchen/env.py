@@ -17,7 +17,7 @@ an episode starts, so that neither data nor policies of an earlier one are taken
 from __future__ import annotations
 
 from contextlib import redirect_stderr
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from io import StringIO
 from typing import Any
@@ -208,6 +208,12 @@ def _clip_to_ranges(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> NDArray
     address = model.jnt_qposadr[limited]
     clipped[address] = np.clip(qpos[address], *model.jnt_range[limited].T)
     return clipped
+
+
+def env_spec(task: str, init_noise: float = 0.05) -> gymnasium.envs.registration.EnvSpec:
+    """Return the EnvSpec of a task; its JSON rebuilds the environment anywhere."""
+    spec = gymnasium.spec(ENV_ID)
+    return replace(spec, kwargs={"task": task, "init_noise": init_noise})
 
 
 gymnasium.register(id=ENV_ID, entry_point="zest_rl.envs:KitchenEnv", max_episode_steps=HORIZON)

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.kitchen.collect import env_spec
-from zest_rl.kitchen.env import HORIZON, KitchenEnv
+from zest_rl.kitchen.env import HORIZON, KitchenEnv, env_spec
 from zest_rl.kitchen.experts import make_expert
 from zest_rl.kitchen.tasks import get_task
 

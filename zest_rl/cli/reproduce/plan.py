@@ -208,13 +208,11 @@ def plan_tasks(collect: Mapping[str, Any], tasks: Mapping[str, Mapping[str, Any]
             f"{sorted(sizes)} and datasets {sorted(ids)}; let the dataset's id in [collect] hold {{task}}, or give "
             "each [tasks.NAME] its own"
         )
-    for name, config in collected.items():
+    for name in collected:
         if not re.fullmatch(r"[A-Za-z0-9_-]+", name) or name == "report":
             raise BadInput(
                 f"{where} [tasks.{name!r}]: the name becomes a file's beside report.html; use letters, digits, - and _"
             )
-        with located(f"{where} [{'tasks' if tasks else 'collect'}]"):
-            config.behaviour()
     return collected
 
 

@@ -1,0 +1,182 @@
+"""An imperfect expert of the kitchen, and its episodes.
+
+As in the paper the expert's actions get uniform noise whose level is drawn per trajectory: episode i acts with
+``clip(expert + U(−s_i, s_i))``, ``s_i = u_i · noise_max``, ``u_i ~ U(0, 1)``. The other ways to fall short, each drawn
+per trajectory, too, are fields of `Behaviour`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.data.writer import Recording
+from zest_rl.errors import BadInput
+from zest_rl.kitchen.collect_config import LARGEST, check_flaws
+from zest_rl.kitchen.env import ACT_DIM, HORIZON, env_spec
+from zest_rl.kitchen.experts import DONE_PROGRESS, Manner, add_uniform_noise, make_expert
+from zest_rl.kitchen.tasks import get_task
+from zest_rl.runtime import artifacts
+from zest_rl.runtime.arrays import Arrays, concatenate
+from zest_rl.runtime.parallel import cached_jobs, chunks, read_parts
+from zest_rl.types import FloatArray
+
+EPISODES_PER_JOB = 5
+STOP_BETWEEN = (0.1, 1.0)
+_CODE = ("behaviour.py", "env.py", "arm.py", "experts.py", "tasks.py")  # decides an episode, beside the behaviour
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """Who acts, and how its episodes are numbered: episode i of a behaviour is always the same episode."""
+
+    task: str
+    policy: str
+    """``"expert"``, or ``"nothing"``: the zero action, the lower reference of the normalized return."""
+    noise_max: float = 0.0
+    """Largest noise level; 1 is the whole action range to either side."""
+    stop_share: float = 0.0
+    """Share of the episodes in which the expert stops early, at a progress drawn from U(`STOP_BETWEEN`)."""
+    slow_max: float = 0.0
+    """The expert makes a share 1 − U(0, slow_max) of its movement at each step."""
+    bias_max: float = 0.0
+    """Largest constant error of an action: each component is off by U(−b, b) all episode, b ~ U(0, bias_max)."""
+    grip_max: float = 0.0
+    """Largest error of the grip, in m: it is off by U(−g, g) along each axis, g ~ U(0, grip_max)."""
+    init_noise: float = 0.05
+    """Half-width of the uniform noise on the arm's start, in rad."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        get_task(self.task)
+        check_flaws({name: getattr(self, name) for name in LARGEST})
+        if self.policy not in ("expert", "nothing"):
+            raise BadInput(f"policy must be 'expert' or 'nothing', got {self.policy!r}")
+        if self.seed < 0:
+            raise BadInput(f"seed must be 0 or positive, got {self.seed}")
+
+    def without_flaws(self) -> Behaviour:
+        """Return the same starts, acted on as well as can be."""
+        values: dict[str, Any] = dict.fromkeys(LARGEST, 0.0)
+        return replace(self, **values)
+
+    def with_value(self, knob: str, value: float) -> Behaviour:
+        """Return this behaviour with another value of one of `LARGEST`."""
+        values: dict[str, Any] = {knob: value}
+        return replace(self, **values)
+
+
+def rollout(behaviour: Behaviour, index: int) -> Arrays:
+    """Run episode `index` of a behaviour: arrays named as in `Recording`, with a leading axis of length 1."""
+    env_seed, noise_seed, manner_seed = np.random.SeedSequence([behaviour.seed, index]).generate_state(3)
+    rng = np.random.default_rng(noise_seed)
+    level = rng.uniform() * behaviour.noise_max
+    manner, bias = draw_manner(behaviour, np.random.default_rng(manner_seed))
+    env = gymnasium.make(env_spec(behaviour.task, behaviour.init_noise))
+    expert = make_expert(behaviour.task, env, manner)
+    steps: dict[str, list[Any]] = {name: [] for name in ("obs", "actions", "qpos", "qvel", "gt_reward", "gt_success")}
+
+    def record(obs: FloatArray, info: dict[str, Any]) -> None:
+        steps["obs"].append(obs)
+        steps["qpos"].append(info["state"]["qpos"])
+        steps["qvel"].append(info["state"]["qvel"])
+        steps["gt_reward"].append(info["gt"]["reward"])
+        steps["gt_success"].append(info["gt"]["success"])
+
+    record(*env.reset(seed=int(env_seed)))
+    for _ in range(HORIZON):
+        action = expert.act() + bias if behaviour.policy == "expert" else np.zeros(ACT_DIM, np.float32)
+        steps["actions"].append(add_uniform_noise(action, level, rng))
+        obs, _, _, _, info = env.step(steps["actions"][-1])
+        record(obs, info)
+    env.close()
+    episode = {name: np.stack(values)[None] for name, values in steps.items()}
+    drawn = {"level": level, "stop_at": manner.stop_at, "speed": manner.speed}
+    return {
+        **episode,
+        "seed": np.array([env_seed], dtype=np.int64),
+        **{name: np.array([value]) for name, value in drawn.items()},
+    }
+
+
+def draw_manner(behaviour: Behaviour, rng: np.random.Generator) -> tuple[Manner, FloatArray]:
+    """Draw how the expert acts in one episode, and the constant error (9,) float32 of its actions.
+
+    Every number is drawn whether it is used or not, so that an episode's draws do not depend on which ways to fall
+    short are switched on, nor on how far: what is calibrated moves each episode along a line.
+    """
+    stops, stop_at, slow, grip, bias = rng.uniform(size=5)
+    directions = rng.uniform(-1.0, 1.0, 3 + ACT_DIM)
+    low, high = STOP_BETWEEN
+    manner = Manner(
+        stop_at=low + (high - low) * stop_at if stops < behaviour.stop_share else DONE_PROGRESS,
+        speed=1.0 - slow * behaviour.slow_max,
+        grip_error=tuple(grip * behaviour.grip_max * directions[:3]),
+    )
+    return manner, (bias * behaviour.bias_max * directions[3:]).astype(np.float32)
+
+
+def _rollouts(job: tuple[Behaviour, range]) -> Arrays:
+    behaviour, indices = job
+    return concatenate([rollout(behaviour, index) for index in indices])
+
+
+def run_behaviour(
+    behaviour: Behaviour,
+    n_episodes: int,
+    *,
+    first: int = 0,
+    n_workers: int | None = None,
+    on_progress: Callable[[int], None] | None = None,
+) -> Arrays:
+    """Run episodes `first` … `first` + `n_episodes` − 1 on all cores; finished parts are kept in the cache.
+
+    Returns:
+        Arrays named as in `Recording`, each with a leading axis of length `n_episodes`.
+    """
+    if n_episodes < 1:
+        raise BadInput(f"n_episodes must be at least 1, got {n_episodes}")
+    folder = behaviour_folder(behaviour)
+    jobs = {}
+    for part in chunks(n_episodes, EPISODES_PER_JOB):
+        indices = range(first + part.start, first + part.stop)
+        jobs[f"episodes-{indices.start}-{indices.stop}"] = (behaviour, indices)
+    for name in cached_jobs(_rollouts, jobs, folder, n_workers=n_workers):
+        if on_progress is not None:
+            on_progress(len(jobs[name][1]))
+    return read_parts(folder, jobs)
+
+
+def behaviour_folder(behaviour: Behaviour) -> Path:
+    """Where `run_behaviour` keeps finished parts."""
+    code = [artifacts.hash_file(Path(__file__).with_name(name)) for name in _CODE]
+    key = {**asdict(behaviour), "code": code, "versions": artifacts.versions()}
+    return artifacts.cache_dir() / "episodes" / artifacts.hash_json(key)[:20]
+
+
+def returns(episodes: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
+    """Ground-truth return of each episode: (N,)."""
+    return np.asarray(episodes["gt_reward"][:, 1:].sum(axis=1, dtype=np.float64))
+
+
+def recordings(episodes: Mapping[str, NDArray[Any]]) -> list[Recording]:
+    """Turn stacked episodes into what `zest_rl.data.writer.write_dataset` takes."""
+    return [
+        Recording(
+            seed=int(episodes["seed"][i]),
+            obs=episodes["obs"][i],
+            actions=episodes["actions"][i],
+            terminated=False,
+            qpos=episodes["qpos"][i],
+            qvel=episodes["qvel"][i],
+            gt_reward=episodes["gt_reward"][i],
+            gt_success=episodes["gt_success"][i],
+        )
+        for i in range(len(episodes["seed"]))
+    ]
