@@ -20,10 +20,12 @@ from zest_rl.analysis.clips import Clip, embed_clips
 from zest_rl.analysis.episode_view import N_FRAMES, EpisodeView
 from zest_rl.data.images import read_image
 from zest_rl.data.video import evenly_spaced, read_frames
-from zest_rl.embedders import Embedder
+from zest_rl.embedders import DEFAULT_EMBEDDER, Precision, load_embedder
 from zest_rl.errors import BadInput
-from zest_rl.kitchen.task_sequence import Performance
-from zest_rl.rewards.goals import TEXT, GoalSpec, embed_goal, read_folder, read_text
+from zest_rl.kitchen.task_sequence import perform
+from zest_rl.kitchen.views import Views
+from zest_rl.rewards.goals import SAME_SCENE, TEXT, GoalSpec, embed_goal, read_folder, read_text
+from zest_rl.rewards.scorer import ScorerConfig
 from zest_rl.rewards.scores import Features, Similarity, score_views
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.types import FloatArray, Frame
@@ -69,23 +71,50 @@ def rise_in_order(sub_goals: Sequence[SubGoalScores]) -> bool:
     return len(known) == len(rises) and all(earlier < later for earlier, later in pairwise(known))
 
 
-def score_performance(
-    performance: Performance,
-    build_scorer: Callable[[str], StateScorer],
-    on_done: Callable[[], object] = lambda: None,
+def follow_kitchen(
+    tasks: Sequence[str],
+    *,
+    goal: str = SAME_SCENE,
+    embedder: str = DEFAULT_EMBEDDER,
+    features: Features = "delta",
+    similarity: Similarity = "cos",
+    precision: Precision = "auto",
+    device: str = "auto",
+    views: int = Views.n_views,
+    tolerance: float = Views.tolerance,
+    seed: int = 0,
+    n_workers: int | None = None,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[SubGoalScores]:
-    """Score all states by the goal of each task, seen from that task's views.
+    """Let experts do kitchen tasks, and score all states by the goal of each task, seen from that task's views.
 
     Args:
-        performance: what was done.
-        build_scorer: task → its scorer.
-        on_done: called after each task.
+        tasks: what is done, in this order.
+        goal: goal spec, of every task.
+        embedder: URI of the network.
+        features: see `zest_rl.rewards.scores`.
+        similarity: see `zest_rl.rewards.scores`.
+        precision: of the embedder.
+        device: where the embedder runs.
+        views: cameras around the object of each task.
+        tolerance: states that agree to this many rad or m are one.
+        seed: of the arm's start.
+        n_workers: processes that embed, default one per core.
+        on_progress: called with (tasks scored, tasks in all).
+
+    Raises:
+        BadInput: a task or the goal does not exist.
+        ZestError: an expert did not succeed from where it had to start.
     """
+    performance = perform(tasks, seed)
+    config = ScorerConfig(goal, embedder, features, similarity, precision)
     sub_goals = []
     for task, done_at in performance.done_at.items():
-        view = EpisodeView(build_scorer(task), performance.states)
+        seen = Views(task, views, tolerance=tolerance)
+        scorer = StateScorer.build(config, seen, performance.states[0], device=device, n_workers=n_workers)
+        view = EpisodeView(scorer, performance.states)
         sub_goals.append(SubGoalScores(task, view.scores, tuple(view.frames), view.steps, done_at))
-        on_done()
+        on_progress(len(sub_goals), len(tasks))
     return sub_goals
 
 
@@ -111,33 +140,44 @@ def read_sub_goal(spec: str, first: Frame) -> GoalSpec:
     )
 
 
-def score_video(
-    path: Path, specs: Sequence[str], embedder: Embedder, n_frames: int, features: Features, similarity: Similarity
+def follow_video(
+    clip: Path,
+    goals: Sequence[str],
+    *,
+    embedder: str = DEFAULT_EMBEDDER,
+    features: Features = "delta",
+    similarity: Similarity = "cos",
+    precision: Precision = "auto",
+    device: str = "auto",
+    n_frames: int = 100,
 ) -> list[SubGoalScores]:
     """Score the frames of a video by each sub-goal.
 
     Args:
-        path: a video, or a folder of pictures in the order of their names.
-        specs: of `read_sub_goal`, all different.
-        embedder: the network.
-        n_frames: how many frames are looked at, evenly spaced.
+        clip: a video, or a folder of pictures in the order of their names.
+        goals: of `read_sub_goal`, all different.
+        embedder: URI of the network.
         features: see `zest_rl.rewards.scores`.
         similarity: see `zest_rl.rewards.scores`.
+        precision: of the embedder.
+        device: where the embedder runs.
+        n_frames: how many frames are looked at, evenly spaced.
 
     Raises:
         BadInput: there is no sub-goal or one twice, the video or a sub-goal cannot be read, or a sentence meets an
             embedder of pictures.
     """
-    if not specs or len(set(specs)) < len(specs):
-        raise BadInput(f"a video needs 1 or more sub-goals, each once, got {', '.join(specs) or 'none'}")
-    frames = read_frames(path, n_frames)
-    goals = [read_sub_goal(spec, frames[0]) for spec in specs]
-    pairs = [embed_goal(goal, embedder) for goal in goals]
-    (embeddings,) = embed_clips([Clip(path, "")], embedder, n_frames)
+    network = load_embedder(embedder, device=device, precision=precision)
+    if not goals or len(set(goals)) < len(goals):
+        raise BadInput(f"a video needs 1 or more sub-goals, each once, got {', '.join(goals) or 'none'}")
+    frames = read_frames(clip, n_frames)
+    specs = [read_sub_goal(goal, frames[0]) for goal in goals]
+    pairs = [embed_goal(spec, network) for spec in specs]
+    (embeddings,) = embed_clips([Clip(clip, "")], network, n_frames)
     steps = evenly_spaced(len(frames), N_FRAMES)
     shown = tuple(frames[step] for step in steps)
-    stems = [spec if spec.startswith(TEXT) else Path(spec).stem for spec in specs]
-    names = stems if len(set(stems)) == len(stems) else specs
+    stems = [goal if goal.startswith(TEXT) else Path(goal).stem for goal in goals]
+    names = stems if len(set(stems)) == len(stems) else goals
     return [
         SubGoalScores(name, score_views(embeddings[:, None], starts, ends, features, similarity), shown, steps)
         for name, (starts, ends) in zip(names, pairs, strict=True)
