@@ -5,17 +5,15 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import h5py
-import minari
 import numpy as np
 import pytest
 from gymnasium import spaces
-from minari.data_collector import EpisodeBuffer
+from minari_files import Recorded, write_minari
 from PIL import Image
 from pyarrow import parquet
 from read_dataset import read
@@ -41,7 +39,7 @@ ROOM = {
 }
 
 
-def write_minari(
+def write_samples(
     dataset_id: str,
     root: Path,
     observation_space: spaces.Space[Any],
@@ -49,31 +47,21 @@ def write_minari(
     lengths: tuple[int, ...] = (4, 6),
     infos: Callable[[int], dict[str, Any]] = lambda n_steps: {},
 ) -> str:
-    """Leave a dataset of samples of its spaces, through Minari's own writer."""
+    """Leave a dataset of samples of its spaces."""
     observation_space.seed(0)
     action_space.seed(0)
     root.mkdir(exist_ok=True)
-    buffers = []
-    for i, length in enumerate(lengths):
+    episodes = []
+    for length in lengths:
         observed = [observation_space.sample() for _ in range(length + 1)]
         parts = (
             {name: np.stack([one[name] for one in observed]) for name in observed[0]}
             if isinstance(observed[0], dict)
             else np.stack(observed)
         )
-        last = np.arange(length) == length - 1
-        buffers.append(
-            EpisodeBuffer(
-                id=i, observations=parts, actions=np.stack([action_space.sample() for _ in range(length)]),
-                rewards=np.arange(length) / 8.0, terminations=last & False, truncations=last, infos=infos(length),
-            )
-        )  # fmt: skip
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # datasets of tests have no author
-        minari.create_dataset_from_buffers(
-            dataset_id, buffers, observation_space=observation_space, action_space=action_space
-        )
-    return dataset_id
+        actions = np.stack([action_space.sample() for _ in range(length)])
+        episodes.append(Recorded(parts, actions, np.arange(length) / 8.0, infos(length)))
+    return write_minari(dataset_id, episodes, observation_space, action_space)
 
 
 VIEWS = Views("micro", n_views=1, size=96, tolerance=0.05)
@@ -352,7 +340,7 @@ def test_the_verb_writes_beside_you_and_over_nothing(
 def test_numbers_in_the_form_of_pictures_are_exported_and_what_is_left_out_is_told(
     root: Path, tmp_path: Path, zest: Callable[..., dict[str, Any]]
 ) -> None:
-    name = write_minari("room/some-v0", root, spaces.Dict(ROOM), spaces.Box(-1, 1, (2,), np.float32))
+    name = write_samples("room/some-v0", root, spaces.Dict(ROOM), spaces.Box(-1, 1, (2,), np.float32))
     told = zest("export", name, "--output", tmp_path / "data.npz")
     assert told["left_out"] == ["observations/camera"]
     with h5py.File(root / name / "data/main_data.hdf5") as file, np.load(tmp_path / "data.npz") as found:
@@ -365,7 +353,7 @@ def test_numbers_in_the_form_of_pictures_are_exported_and_what_is_left_out_is_to
 def test_progress_of_pictures_alone_is_exported_and_told_of_by_inspect(
     root: Path, goal: Path, tmp_path: Path, zest: Callable[..., dict[str, Any]]
 ) -> None:
-    name = write_minari("room/seen-v0", root, ROOM["camera"], spaces.Box(-1, 1, (2,), np.float32), (2, 3, 2))
+    name = write_samples("room/seen-v0", root, ROOM["camera"], spaces.Box(-1, 1, (2,), np.float32), (2, 3, 2))
     scored = zest("relabel", name, "--goal", goal, "--n-workers", "1")
     told = zest("export", scored["dataset"], "--to", "lerobot-progress", "--output", tmp_path / "progress.parquet")
     assert (told["n_episodes"], told["n_transitions"], told["arrays"]) == (3, 7, ["zest_score"])
@@ -381,7 +369,7 @@ def test_progress_of_pictures_alone_is_exported_and_told_of_by_inspect(
 def test_discrete_actions_stay_whole_numbers_for_those_that_take_them(
     root: Path, goal: Path, tmp_path: Path, zest: Callable[..., dict[str, Any]]
 ) -> None:
-    name = write_minari("room/buttons-v0", root, spaces.Dict(ROOM), spaces.Discrete(4))
+    name = write_samples("room/buttons-v0", root, spaces.Dict(ROOM), spaces.Discrete(4))
     told = zest("relabel", name, "--goal", goal, "--n-workers", "1")
     scored = told["dataset"]
     assert told["next"] == f"zest export {scored} --to npz"
@@ -408,7 +396,7 @@ def test_discrete_actions_stay_whole_numbers_for_those_that_take_them(
 
 
 def test_several_whole_numbers_per_action_are_not_taken_for_one(root: Path, tmp_path: Path) -> None:
-    name = write_minari("room/switches-v0", root, spaces.Dict(ROOM), spaces.MultiDiscrete([2, 3]))
+    name = write_samples("room/switches-v0", root, spaces.Dict(ROOM), spaces.MultiDiscrete([2, 3]))
     with np.load(export(name, "npz", tmp_path / "data.npz").path) as found:
         assert (found["actions"].shape, found["actions"].dtype) == ((10, 2), np.int64)
     with pytest.raises(BadInput, match="d3rlpy takes one whole number per action, got 2"):
@@ -416,7 +404,7 @@ def test_several_whole_numbers_per_action_are_not_taken_for_one(root: Path, tmp_
     assert not (tmp_path / "x").exists()
     for i, space in enumerate((spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2))):
         with pytest.raises(BadInput, match="its actions are discrete"):
-            read(write_minari(f"room/bits{i}-v0", root, spaces.Dict(ROOM), space), Dataset.episodes)
+            read(write_samples(f"room/bits{i}-v0", root, spaces.Dict(ROOM), space), Dataset.episodes)
 
 
 @pytest.mark.parametrize(
@@ -426,7 +414,7 @@ def test_several_whole_numbers_per_action_are_not_taken_for_one(root: Path, tmp_
 def test_relabel_names_training_where_actions_can_be_trained_on(
     root: Path, goal: Path, zest: Callable[..., dict[str, Any]], actions: spaces.Space[Any], verb: str
 ) -> None:
-    name = write_minari("room/wide-v0", root, spaces.Dict(ROOM), actions)
+    name = write_samples("room/wide-v0", root, spaces.Dict(ROOM), actions)
     assert zest("relabel", name, "--goal", goal, "--n-workers", "1")["next"].startswith(f"zest {verb} ")
 
 
@@ -435,7 +423,7 @@ def test_infos_are_not_measured_by_the_space_of_the_observations(root: Path) -> 
         return {"heat": np.full((n_steps + 1, 10, 10), 50.0)}
 
     shares, actions = spaces.Box(0, 1, (16, 16), np.float32), spaces.Box(-1, 1, (2,), np.float32)
-    name = write_minari("room/heat-v0", root, shares, actions, infos=infos)
+    name = write_samples("room/heat-v0", root, shares, actions, infos=infos)
     with h5py.File(root / name / "data/main_data.hdf5") as file:
         assert is_numbers(file["episode_0/infos/heat"])
         assert not is_numbers(file["episode_0/observations"])
@@ -445,7 +433,7 @@ def test_infos_are_not_measured_by_the_space_of_the_observations(root: Path) -> 
     ("space", "n"), [(spaces.Box(-9, 9, (3, 4), np.float32), 12), (spaces.Discrete(5), 1), (ROOM["grid"], 100)]
 )
 def test_bare_observations_of_any_form_are_flattened(root: Path, space: spaces.Space[Any], n: int) -> None:
-    name = write_minari("room/bare-v0", root, space, spaces.Box(-1, 1, (2,), np.float32))
+    name = write_samples("room/bare-v0", root, space, spaces.Box(-1, 1, (2,), np.float32))
     with h5py.File(root / name / "data/main_data.hdf5") as file:
         for i, episode in enumerate(read(name, Dataset.episodes)):
             stored = file[f"episode_{i}/observations"][()]
@@ -454,7 +442,7 @@ def test_bare_observations_of_any_form_are_flattened(root: Path, space: spaces.S
 
 @pytest.mark.parametrize("to", ["npz", "d4rl", "robomimic", "d3rlpy", "torchrl", "lerobot"])
 def test_actions_of_several_dimensions_are_flattened(root: Path, tmp_path: Path, to: str) -> None:
-    name = write_minari("room/arms-v0", root, spaces.Dict(ROOM), spaces.Box(-1, 1, (2, 3), np.float32))
+    name = write_samples("room/arms-v0", root, spaces.Dict(ROOM), spaces.Box(-1, 1, (2, 3), np.float32))
     assert export(name, to, tmp_path / "data").n_transitions == 10  # type: ignore[arg-type]
     with h5py.File(root / name / "data/main_data.hdf5") as file:
         for i, episode in enumerate(transitions(name)):
@@ -468,7 +456,7 @@ def test_success_of_the_source_stands_beside_the_scores(
     def infos(n_steps: int) -> dict[str, Any]:
         return {info: np.arange(n_steps + 1) == n_steps - 1}
 
-    name = write_minari("room/done-v0", root, spaces.Dict(ROOM), spaces.Box(-1, 1, (2,), np.float32), infos=infos)
+    name = write_samples("room/done-v0", root, spaces.Dict(ROOM), spaces.Box(-1, 1, (2,), np.float32), infos=infos)
     scored = zest("relabel", name, "--goal", goal, "--n-workers", "1")["dataset"]
     with np.load(export(scored, "npz", tmp_path / "data.npz").path) as found:
         assert np.flatnonzero(found["success"]).tolist() == [2, 8]
@@ -491,7 +479,7 @@ def clips(folder: Path) -> Path:
 
 
 def test_a_single_episode_is_one_to_train_robomimic_on(root: Path, tmp_path: Path) -> None:
-    name = write_minari("room/one-v0", root, spaces.Dict(ROOM), spaces.Box(-1, 1, (2,), np.float32), (4,))
+    name = write_samples("room/one-v0", root, spaces.Dict(ROOM), spaces.Box(-1, 1, (2,), np.float32), (4,))
     with h5py.File(export(name, "robomimic", tmp_path / "data.hdf5").path) as file:
         masks = {mask: members[()].tolist() for mask, members in file["mask"].items()}
     assert masks == {"train": [b"demo_0"], "valid": []}

@@ -1,0 +1,70 @@
+"""Videos and folders of pictures beside a dataset without frames."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+from PIL import Image
+from read_dataset import read
+from rollouts import Episode, Run, expected_scores, write_blind
+
+from zest_rl.data.reader import Dataset
+from zest_rl.types import Frame
+
+
+def write_video(path: Path, frames: list[Frame]) -> None:
+    """H.264 as people have it."""
+    imageio.mimwrite(path, frames, fps=10, codec="libx264", quality=9, macro_block_size=2)
+
+
+def test_folders_of_videos_and_of_pictures_are_views(
+    maze: list[Episode], goal: Path, zest: Run, tmp_path: Path
+) -> None:
+    for i, episode in enumerate(maze):
+        (tmp_path / "top" / f"episode_{i:03d}").mkdir(parents=True)
+        for t, frame in enumerate(episode.frames):
+            Image.fromarray(frame).save(tmp_path / "top" / f"episode_{i:03d}" / f"frame{t}.png")
+        (tmp_path / "films").mkdir(exist_ok=True)
+        write_video(tmp_path / "films" / f"episode_{i}.mp4", episode.frames)
+    dataset = write_blind(maze)
+    top = zest("relabel", dataset, "--goal", goal, "--frames", tmp_path / "top", "--n-workers", "1")
+    for episode, scores in zip(maze, read(top["dataset"], Dataset.scores), strict=True):
+        np.testing.assert_allclose(scores, expected_scores([episode.frames], goal), atol=1e-4)
+    folders = [tmp_path / "top", tmp_path / "films"]
+    both = zest("relabel", dataset, "--goal", goal, "--frames", *folders, "--n-workers", "1")
+    assert both["views"] == ["top", "films"]
+    films = [imageio.mimread(tmp_path / "films" / f"episode_{i}.mp4") for i in range(len(maze))]
+    for episode, film, scores in zip(maze, films, read(both["dataset"], Dataset.scores), strict=True):
+        np.testing.assert_allclose(scores, expected_scores([episode.frames, list(film)], goal), atol=1e-4)
+
+
+def test_one_frame_may_be_missing_at_the_end_and_no_more(
+    maze: list[Episode], goal: Path, zest: Run, refusal: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    dataset = write_blind(maze)
+    words = ["relabel", dataset, "--goal", goal, "--frames", tmp_path / "films", "--n-workers", "1"]
+
+    def leave(n_missing: int) -> None:
+        shutil.rmtree(tmp_path / "films", ignore_errors=True)
+        for i, episode in enumerate(maze):
+            folder = tmp_path / "films" / f"episode_{i}"
+            folder.mkdir(parents=True)
+            for t, frame in enumerate(episode.frames[: len(episode.frames) - n_missing]):
+                Image.fromarray(frame).save(folder / f"{t}.png")
+
+    leave(1)
+    scores = read(zest(*words)["dataset"], Dataset.scores)
+    for episode, one in zip(maze, scores, strict=True):
+        np.testing.assert_allclose(one[:-1], expected_scores([episode.frames[:-1]], goal), atol=1e-4)
+        assert one[-1] == one[-2]
+    leave(2)
+    code, error = refusal(*words)
+    assert code == 2
+    assert "episode 0 has 4 actions, so it needs 5 frames (x_0 … x_T), or 4 without the last; got 3" in error
+    shutil.rmtree(tmp_path / "films" / "episode_1")
+    code, error = refusal(*words)
+    assert (code, "1 are missing, the first is 1" in error) == (2, True)
