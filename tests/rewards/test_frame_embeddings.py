@@ -16,14 +16,14 @@ from zest_rl.rewards.frame_embeddings import FrameEmbeddings
 from zest_rl.rewards.state_embeddings import EmbedConfig, StateEmbedder, StateEmbeddings
 from zest_rl.sources import Source, open_source
 from zest_rl.sources.kitchen import KitchenStates, kitchen_source
-from zest_rl.sources.videos import Clips
+from zest_rl.sources.videos import EpisodeVideos
 from zest_rl.types import Frame
 
 N_EPISODES = 4
 
 
 @dataclass(frozen=True)
-class CountedClips(Clips):
+class CountedVideos(EpisodeVideos):
     """Real pictures in folders, that tell how often they are sent to a process; here they wait for all but one."""
 
     cache: Path
@@ -31,7 +31,7 @@ class CountedClips(Clips):
 
     def __reduce__(self) -> tuple[Any, ...]:
         self.n_sent[0] += 1
-        return Clips, (self.paths,)
+        return EpisodeVideos, (self.paths,)
 
     def read(self, episode: int) -> Iterator[Sequence[Frame]]:
         deadline = time.monotonic() + 60
@@ -62,8 +62,8 @@ def picture(rng: np.random.Generator) -> np.ndarray:
 
 
 def test_the_paths_of_all_episodes_are_not_sent_with_each_job(source: Source, tmp_path: Path) -> None:
-    assert isinstance(source.frames, Clips)
-    counted = CountedClips(source.frames.paths, tmp_path / "cache", [0])
+    assert isinstance(source.frames, EpisodeVideos)
+    counted = CountedVideos(source.frames.paths, tmp_path / "cache", [0])
     embeddings = FrameEmbeddings(Source(source.trajectories, counted), "efficientnet-lite0", device="cpu", n_workers=2)
     embeddings.embed()
     assert counted.n_sent == [2], "once to each worker"

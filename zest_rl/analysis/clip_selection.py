@@ -29,7 +29,7 @@ GOAL_SHARE = 0.2
 
 
 @dataclass(frozen=True)
-class Frames:
+class ClipFrames:
     """Frames of clips, as candidates of a selection."""
 
     embeddings: FloatArray
@@ -67,7 +67,7 @@ def candidates(
     same_context: bool = True,
     left_out: int | None = None,
     seed: int = 0,
-) -> Frames:
+) -> ClipFrames:
     """Take the frames of clips, but for the clip that specifies the goal.
 
     Args:
@@ -88,7 +88,7 @@ def candidates(
         for i, n in zip(pool, lengths, strict=True)
     ]
     starts = [embeddings[pool[context]][:1] for context in contexts]
-    return Frames(
+    return ClipFrames(
         np.concatenate([embeddings[i][1:] for i in pool]),
         np.concatenate([np.repeat(start, n - 1, axis=0) for start, n in zip(starts, lengths, strict=True)]),
         np.repeat(pool, np.array(lengths) - 1),

@@ -81,7 +81,7 @@ class RelabelRecord:
     n_still_frames: int | None = None
     """Frames without any change against their first frame."""
     frames: Mapping[str, Any] | None = None
-    """Where frames come from that are not rendered from kitchen states (`zest_rl.sources.base.Frames.describe`)."""
+    """Where frames come from that are not rendered from kitchen states (`sources.base.EpisodeFrames.describe`)."""
     frames_sha256: str | None = None
     provenance: Mapping[str, Any] | None = None
     """Command, versions and machine; left out of a run's ``meta.json``."""

@@ -22,7 +22,7 @@ from zest_rl.rewards.embeddings import EmbeddedEpisode, check_same_embedder, sha
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_arrays
 from zest_rl.runtime.parallel import Engine, cached_jobs, one_thread
-from zest_rl.sources.base import Frames, Source
+from zest_rl.sources.base import EpisodeFrames, Source
 
 STEPS_PER_BATCH = 16
 
@@ -31,7 +31,7 @@ STEPS_PER_BATCH = 16
 class _Shared:
     """What the jobs have in common: with the paths of all episodes, it is sent to a worker once and not with each."""
 
-    frames: Frames
+    frames: EpisodeFrames
     embedder: str
     precision: Precision
     device: str

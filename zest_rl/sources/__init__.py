@@ -5,7 +5,7 @@
 | Minari dataset of zest/Kitchen-v1 | copied | its states, rendered from a ring of views (`kitchen`) |
 | Minari dataset with pictures among its observations | copied | those (`pictures`) |
 | Minari dataset with recorded MuJoCo states, or with `--camera NAME` | copied | rendered from the model (`states`) |
-| any of these with `--frames FOLDER …` | | videos or pictures in a folder (`clips`) |
+| any of these with `--frames FOLDER …` | | videos or pictures in a folder (`videos`) |
 | robomimic's HDF5 | imported (`robomimic`) | its pictures |
 | LeRobot v3 folder | imported (`lerobot`) | its videos |
 """
@@ -21,12 +21,12 @@ from zest_rl.data.observations import choose_pictures
 from zest_rl.data.writer import DatasetCopy, Trajectories
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.views import Views
-from zest_rl.sources.base import Frames, Source
+from zest_rl.sources.base import EpisodeFrames, Source
 from zest_rl.sources.kitchen import KitchenStates, read_kitchen
 from zest_rl.sources.pictures import Pictures, picture_entries
-from zest_rl.sources.videos import find_clips
+from zest_rl.sources.videos import find_videos
 
-__all__ = ["Frames", "KitchenStates", "Source", "open_source"]
+__all__ = ["EpisodeFrames", "KitchenStates", "Source", "open_source"]
 
 
 def _is_path(dataset: str) -> bool:
@@ -80,7 +80,7 @@ def open_source(
         if folders and len(folders) < len(frames):
             raise BadInput(f"--frames must be folders or entries of the dataset, not both; got {', '.join(frames)}")
         keys = [] if folders else frames
-        found: Frames | None
+        found: EpisodeFrames | None
         trajectories: Trajectories
         if ds is None:
             if cameras:
@@ -90,13 +90,13 @@ def open_source(
             found = None if folders else _minari_frames(ds, keys, cameras)
             trajectories = DatasetCopy.of(ds)
     if folders:
-        found = find_clips(folders, len(trajectories.n_steps), dataset)
+        found = find_videos(folders, len(trajectories.n_steps), dataset)
     if found is None:
         raise BadInput(f"{dataset} shows no frames; give --frames FOLDER with a video of each episode")
     return Source(trajectories, found)
 
 
-def _open_path(path: Path, keys: Sequence[str], *, with_frames: bool) -> tuple[Trajectories, Frames | None]:
+def _open_path(path: Path, keys: Sequence[str], *, with_frames: bool) -> tuple[Trajectories, EpisodeFrames | None]:
     from zest_rl.sources.lerobot import is_lerobot, open_lerobot
     from zest_rl.sources.robomimic import open_robomimic
 
@@ -108,7 +108,7 @@ def _open_path(path: Path, keys: Sequence[str], *, with_frames: bool) -> tuple[T
     return (open_lerobot if path.is_dir() else open_robomimic)(path, keys, with_frames=with_frames)
 
 
-def _minari_frames(ds: reader.Dataset, keys: Sequence[str], cameras: Sequence[str]) -> Frames:
+def _minari_frames(ds: reader.Dataset, keys: Sequence[str], cameras: Sequence[str]) -> EpisodeFrames:
     names = list(ds.groups)
     found = picture_entries(ds.file, f"{names[0]}/observations")
     if cameras or not (keys or any(found.values())):

@@ -10,7 +10,7 @@ from zest_rl.data.writer import Trajectories
 from zest_rl.types import Frame
 
 
-class Frames(Protocol):
+class EpisodeFrames(Protocol):
     """The frames of every episode, from one view or several. It is sent to worker processes: small, and frozen."""
 
     @property
@@ -35,4 +35,4 @@ class Source:
     """A dataset to relabel."""
 
     trajectories: Trajectories
-    frames: Frames
+    frames: EpisodeFrames

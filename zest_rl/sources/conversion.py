@@ -67,7 +67,7 @@ def fingerprint(episodes: Iterable[ConvertedEpisode]) -> str:
 
 
 def stored(episode: ConvertedEpisode) -> dict[str, NDArray[Any]]:
-    """Return what `fill` writes of an episode but its rewards, under the names on disk."""
+    """Return what `write_converted` writes of an episode but its rewards, under the names on disk."""
     last = np.arange(len(episode.actions)) == len(episode.actions) - 1
     success = {} if episode.success is None else {SOURCE_SUCCESS: np.concatenate([[False], episode.success])}
     return {
@@ -79,7 +79,7 @@ def stored(episode: ConvertedEpisode) -> dict[str, NDArray[Any]]:
     }
 
 
-def fill(
+def write_converted(
     folder: Path, dataset_id: str, episodes: Iterable[ConvertedEpisode], description: str, *, fps: float | None = None
 ) -> None:
     """Write the files of a Minari dataset, see `zest_rl.data.writer.Trajectories`; `fps` are steps per second."""

@@ -19,7 +19,7 @@ from zest_rl.types import Frame
 
 @dataclass(frozen=True, eq=False)
 class KitchenStates:
-    """`Frames` of the kitchen's states. Equal states have equal frames, so that each need be seen but once."""
+    """`EpisodeFrames` of the kitchen's states. Equal states have equal frames, so that each need be seen but once."""
 
     states: Sequence[NDArray[np.float64]]
     """(T+1, nq) simulator positions of every episode."""

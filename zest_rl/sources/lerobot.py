@@ -76,7 +76,7 @@ class Rows:
     def fill(self, folder: Path) -> None:
         """Write them as a Minari dataset."""
         description = f"Imported from {self.root.name} (LeRobot)."
-        conversion.fill(folder, self.dataset_id, self.episodes(), description, fps=self.fps)
+        conversion.write_converted(folder, self.dataset_id, self.episodes(), description, fps=self.fps)
 
     def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
         """Yield what is written of each episode."""
@@ -129,7 +129,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Videos:
-    """`Frames` of videos that hold several episodes each."""
+    """`EpisodeFrames` of videos that hold several episodes each."""
 
     views: tuple[str, ...]
     fps: float

@@ -16,7 +16,7 @@ from zest_rl.types import Frame
 
 @dataclass(frozen=True)
 class Pictures:
-    """`Frames` that are stored in one HDF5 file, one group per episode."""
+    """`EpisodeFrames` that are stored in one HDF5 file, one group per episode."""
 
     file: Path
     episodes: tuple[str, ...]

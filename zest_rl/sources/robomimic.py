@@ -51,7 +51,9 @@ class Demos:
 
     def fill(self, folder: Path) -> None:
         """Write them as a Minari dataset."""
-        conversion.fill(folder, self.dataset_id, self.episodes(), f"Imported from {self.file.name} (robomimic).")
+        conversion.write_converted(
+            folder, self.dataset_id, self.episodes(), f"Imported from {self.file.name} (robomimic)."
+        )
 
     def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
         """Yield what is written of each episode."""

@@ -33,7 +33,7 @@ _DEFAULT_CAMERA = "the environment's own camera"
 
 @dataclass(frozen=True)
 class States:
-    """`Frames` rendered from what is recorded of the simulator in a Minari dataset."""
+    """`EpisodeFrames` rendered from what is recorded of the simulator in a Minari dataset."""
 
     file: Path
     episodes: tuple[str, ...]

@@ -20,8 +20,8 @@ _NAME = re.compile(r"episode_0*(\d+)")
 
 
 @dataclass(frozen=True)
-class Clips:
-    """`Frames` of videos or folders of pictures."""
+class EpisodeVideos:
+    """`EpisodeFrames` of videos or folders of pictures."""
 
     paths: tuple[tuple[Path, ...], ...]
     """Per view, per episode."""
@@ -58,8 +58,8 @@ def _files(path: Path) -> list[Path]:
     return frame_files(path) if path.is_dir() else [path]
 
 
-def find_clips(folders: Sequence[Path], n_episodes: int, what: str) -> Clips:
-    """Find the clip of every episode in each folder.
+def find_videos(folders: Sequence[Path], n_episodes: int, what: str) -> EpisodeVideos:
+    """Find the video of every episode in each folder.
 
     Args:
         folders: one per view.
@@ -67,7 +67,7 @@ def find_clips(folders: Sequence[Path], n_episodes: int, what: str) -> Clips:
         what: names the dataset in an error.
 
     Raises:
-        BadInput: a clip is missing, is there twice, or is of no episode.
+        BadInput: a video is missing, is there twice, or is of no episode.
     """
     paths = []
     for folder in folders:
@@ -87,4 +87,4 @@ def find_clips(folders: Sequence[Path], n_episodes: int, what: str) -> Clips:
                 + (f"{len(missing)} are missing, the first is {missing[0]}" if missing else f"got {len(found)}")
             )
         paths.append(tuple(found[number] for number in range(n_episodes)))
-    return Clips(tuple(paths))
+    return EpisodeVideos(tuple(paths))

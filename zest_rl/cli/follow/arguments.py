@@ -12,7 +12,7 @@ from zest_rl.rewards.scores import Features, Similarity, check_names
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
+class FollowArguments:
     """What both kinds of episode need."""
 
     what: ClassVar[str]
@@ -34,7 +34,7 @@ class Arguments:
 
 
 @dataclass(frozen=True, kw_only=True)
-class KitchenArguments(Arguments):
+class KitchenArguments(FollowArguments):
     """Experts do several kitchen tasks one after another; each task is a sub-goal, seen from its own views."""
 
     what: ClassVar[str] = "kitchen"
@@ -53,7 +53,7 @@ class KitchenArguments(Arguments):
 
 
 @dataclass(frozen=True, kw_only=True)
-class VideoArguments(Arguments):
+class VideoArguments(FollowArguments):
     """A video, or a folder of pictures in the order of their names; each sub-goal is a picture (the video's first frame
     is its start), a folder with init/ and goal/, or "text:START -> GOAL". In a recipe, $NAME in a path stands for an
     environment variable.
