@@ -101,6 +101,13 @@ def test_a_file_has_at_most_400_lines(path: Path) -> None:
     assert len(path.read_text().splitlines()) <= 400, "split it along its jobs"
 
 
+@pytest.mark.parametrize("path", sorted((PACKAGE / "cli").rglob("*.py")), ids=module_name)
+def test_a_verb_reads_flags_calls_the_library_and_prints(path: Path) -> None:
+    parts = module_name(path).split(".")
+    if parts not in (["cli"], ["cli", "config"], ["cli", "ui"]) and parts[1] not in ("reproduce", "select"):
+        assert len(path.read_text().splitlines()) <= 80, "what it does belongs into a room below"
+
+
 def test_only_the_env_module_imports_gymnasium_robotics() -> None:
     users = {
         module_name(path)

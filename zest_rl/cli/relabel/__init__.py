@@ -1,0 +1,61 @@
+"""``zest relabel``: a dataset and a goal → a copy whose rewards are ZeST scores."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from zest_rl.cli.relabel.arguments import Config
+from zest_rl.cli.ui import Ui, progress_in_parts
+
+if TYPE_CHECKING:
+    from zest_rl.data.reader import Dataset
+
+__all__ = ["Config", "run"]
+
+
+def run(config: Config, ui: Ui) -> dict[str, Any]:
+    """Render or read, embed, score, write."""
+    import time
+
+    import numpy as np
+
+    from zest_rl.data.reader import open_dataset
+    from zest_rl.rewards.relabel import relabel
+
+    started = time.monotonic()
+    with progress_in_parts(ui, "embedding frames") as on_progress:
+        relabeled = relabel(**vars(config), on_progress=on_progress)
+    if relabeled.already_there:
+        ui.say(f"{relabeled.dataset_id} is there already, nothing to do")
+    if relabeled.source.frames.describe().get("qpos_is_noisy"):
+        ui.warn("states are read from observations that the environment blurred: what is shown trembles a little")
+    with open_dataset(relabeled.dataset_id) as ds:
+        returns = np.array([rewards.sum() for rewards in ds.rewards()])
+        command = _next_command(ds)
+    if np.ptp(returns) == 0:
+        ui.warn("all episodes have the same return: this goal and embedder tell nothing apart")
+    return {
+        "dataset": relabeled.dataset_id,
+        "path": str(relabeled.path),
+        "n_frames": relabeled.n_frames,
+        "views": list(relabeled.source.frames.views),
+        f"n_{relabeled.unit}_embedded": relabeled.n_embedded,
+        "n_still_frames": relabeled.n_still,
+        "return_min": float(returns.min()),
+        "return_max": float(returns.max()),
+        "seconds": round(time.monotonic() - started, 2),
+        "next": command,
+    }
+
+
+def _next_command(ds: Dataset) -> str:
+    """Name a command that works on what a dataset observes and how it acts."""
+    import numpy as np
+
+    from zest_rl.data.observations import acts_discretely, entries, is_numbers
+
+    groups = list(ds.groups.values())
+    if not any(map(is_numbers, entries(groups[0]["observations"]).values())):
+        return f"zest inspect {ds.id}"
+    trains = all(not acts_discretely(group) and np.abs(group["actions"][()]).max() <= 1 for group in groups)
+    return f"zest train dt {ds.id}" if trains else f"zest export {ds.id} --to npz"
