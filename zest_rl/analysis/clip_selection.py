@@ -92,7 +92,7 @@ def candidates(
         np.concatenate([embeddings[i][1:] for i in pool]),
         np.concatenate([np.repeat(start, n - 1, axis=0) for start, n in zip(starts, lengths, strict=True)]),
         np.repeat(pool, np.array(lengths) - 1),
-        np.concatenate([one[1:] for one in reached]),
+        np.concatenate([frames[1:] for frames in reached]),
     )
 
 
@@ -128,9 +128,9 @@ class ClipSelection:
 
     def mean(self) -> dict[str, float]:
         """Return the means over objects, and how many times better than random the highest scores are."""
-        found = float(np.mean([judged.top_n_success.value for judged in self.objects.values()]))
+        success = float(np.mean([judged.top_n_success.value for judged in self.objects.values()]))
         chance = float(np.mean([judged.goal_frame_ratio for judged in self.objects.values()]))
-        return {"top_n_success": found, "goal_frame_ratio": chance, "times_random": found / chance}
+        return {"top_n_success": success, "goal_frame_ratio": chance, "times_random": success / chance}
 
 
 def select_clips(

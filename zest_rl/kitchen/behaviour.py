@@ -66,9 +66,9 @@ class Behaviour:
         values: dict[str, Any] = dict.fromkeys(LARGEST, 0.0)
         return replace(self, **values)
 
-    def with_value(self, knob: str, value: float) -> Behaviour:
+    def with_value(self, flaw: str, value: float) -> Behaviour:
         """Return this behaviour with another value of one of `LARGEST`."""
-        values: dict[str, Any] = {knob: value}
+        values: dict[str, Any] = {flaw: value}
         return replace(self, **values)
 
 

@@ -68,7 +68,7 @@ def measure_references(
 
 def calibrate(
     behaviour: Behaviour,
-    knob: str,
+    flaw: str,
     n_episodes: int,
     references: References,
     target: float,
@@ -84,8 +84,8 @@ def calibrate(
     meets the target (kept off both ends), and twice the value while none was low enough.
 
     Args:
-        behaviour: what acts; its field `knob` is ignored.
-        knob: a key of `LARGEST`.
+        behaviour: what acts; its field `flaw` is ignored.
+        flaw: a key of `LARGEST`.
         n_episodes: the dataset's size; the very episodes of the dataset are used.
         references: the two ends of the scale.
         target: percent of the expert, e.g. 81.19.
@@ -95,36 +95,36 @@ def calibrate(
         on_round: called with (value, percent) after each.
 
     Raises:
-        BadInput: `target` is not in (0, 100], or `knob` is not one that can be calibrated.
+        BadInput: `target` is not in (0, 100], or `flaw` is not one that can be calibrated.
         ZestError: no value within `tolerance` was found.
     """
     if not 0 < target <= 100:
         raise BadInput(f"the level to calibrate to must be in (0, 100] percent of the expert, got {target}")
-    if knob not in LARGEST:
-        raise BadInput(f"{knob!r} cannot be calibrated; {nearest(knob, LARGEST)}")
+    if flaw not in LARGEST:
+        raise BadInput(f"{flaw!r} cannot be calibrated; {nearest(flaw, LARGEST)}")
     below, above = (0.0, 100.0), None  # (value, level) next to the target
-    only_flaw = behaviour.with_value(knob, 0.0) == behaviour.without_flaws()
-    value = 0.3 * LARGEST[knob] if only_flaw else 0.0  # with no other flaw the level at 0 is the expert's
+    only_flaw = behaviour.with_value(flaw, 0.0) == behaviour.without_flaws()
+    value = 0.3 * LARGEST[flaw] if only_flaw else 0.0  # with no other flaw the level at 0 is the expert's
     for _ in range(n_rounds):
-        tried = behaviour.with_value(knob, round(value, 4))
+        tried = behaviour.with_value(flaw, round(value, 4))
         episodes = run_behaviour(tried, n_episodes, n_workers=n_workers)
         level = float(statistics.normalized_return(returns(episodes), references.minimum, references.expert).mean())
         if on_round is not None:
-            on_round(getattr(tried, knob), level)
+            on_round(getattr(tried, flaw), level)
         if abs(level - target) <= tolerance:
             return tried
-        if value == (LARGEST[knob] if level > target else 0.0):
+        if value == (LARGEST[flaw] if level > target else 0.0):
             break  # no further to go
         if level > target:
             below = (value, level)
         else:
             above = (value, level)
         if above is None:
-            value = min(2 * value or 0.3 * LARGEST[knob], LARGEST[knob])
+            value = min(2 * value or 0.3 * LARGEST[flaw], LARGEST[flaw])
         else:
             share = (below[1] - target) / (below[1] - above[1]) if below[1] > above[1] else 0.5
             value = below[0] + np.clip(share, 0.1, 0.9) * (above[0] - below[0])
     raise ZestError(
-        f"no {knob} in [0, {LARGEST[knob]}] brings the dataset to {target} ± {tolerance} % of the expert (the last "
-        f"try, {getattr(tried, knob)}, gave {level:.2f} %); collect more episodes or choose it by hand"
+        f"no {flaw} in [0, {LARGEST[flaw]}] brings the dataset to {target} ± {tolerance} % of the expert (the last "
+        f"try, {getattr(tried, flaw)}, gave {level:.2f} %); collect more episodes or choose it by hand"
     )

@@ -27,7 +27,7 @@ class Scene:
     def with_joint(self, qpos: NDArray[np.float64], joint: str, position: float) -> NDArray[np.float64]:
         """Return a copy of a state (n_qpos,) with one of the scene's joints moved to `position` (rad or m).
 
-        What the model couples to the joint moves along: in the kitchen a burner rises, and so turns red, with its knob.
+        What the model couples to the joint moves along.
         """
         model, first = self.model, self.visible.start
         mover = model.joint(joint).id

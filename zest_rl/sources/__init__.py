@@ -76,24 +76,24 @@ def open_source(
             )
         if frames and cameras:
             raise BadInput("--camera renders recorded states, --frames says where pictures are; give one of them")
-        folders = [Path(one).expanduser().resolve() for one in frames if Path(one).expanduser().is_dir()]
+        folders = [path.resolve() for path in (Path(name).expanduser() for name in frames) if path.is_dir()]
         if folders and len(folders) < len(frames):
             raise BadInput(f"--frames must be folders or entries of the dataset, not both; got {', '.join(frames)}")
         keys = [] if folders else frames
-        found: EpisodeFrames | None
+        episode_frames: EpisodeFrames | None
         trajectories: Trajectories
         if ds is None:
             if cameras:
                 raise BadInput("--camera renders the states of Minari datasets alone; leave it out")
-            trajectories, found = _open_path(Path(dataset).expanduser(), keys, with_frames=not folders)
+            trajectories, episode_frames = _open_path(Path(dataset).expanduser(), keys, with_frames=not folders)
         else:
-            found = None if folders else _minari_frames(ds, keys, cameras)
+            episode_frames = None if folders else _minari_frames(ds, keys, cameras)
             trajectories = DatasetCopy.of(ds)
     if folders:
-        found = find_videos(folders, len(trajectories.n_steps), dataset)
-    if found is None:
+        episode_frames = find_videos(folders, len(trajectories.n_steps), dataset)
+    if episode_frames is None:
         raise BadInput(f"{dataset} shows no frames; give --frames FOLDER with a video of each episode")
-    return Source(trajectories, found)
+    return Source(trajectories, episode_frames)
 
 
 def _open_path(path: Path, keys: Sequence[str], *, with_frames: bool) -> tuple[Trajectories, EpisodeFrames | None]:
@@ -110,11 +110,11 @@ def _open_path(path: Path, keys: Sequence[str], *, with_frames: bool) -> tuple[T
 
 def _minari_frames(ds: reader.Dataset, keys: Sequence[str], cameras: Sequence[str]) -> EpisodeFrames:
     names = list(ds.groups)
-    found = picture_entries(ds.file, f"{names[0]}/observations")
-    if cameras or not (keys or any(found.values())):
+    pictures = picture_entries(ds.file, f"{names[0]}/observations")
+    if cameras or not (keys or any(pictures.values())):
         from zest_rl.sources.states import find_states
 
         return find_states(ds.file, names, ds.record.env_spec, cameras, f"dataset {ds.id}")
-    chosen = choose_pictures(found, keys, f"dataset {ds.id}", "observations")
+    chosen = choose_pictures(pictures, keys, f"dataset {ds.id}", "observations")
     views = tuple("/".join(part for part in ("observations", key) if part) for key in chosen)
     return Pictures(ds.file, tuple(names), views)

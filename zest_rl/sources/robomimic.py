@@ -100,11 +100,11 @@ def open_robomimic(path: Path, keys: Sequence[str], *, with_frames: bool = True)
     try:
         with h5py.File(path, "r") as file:
             demos = file.get("data")
-            found = [name for name in demos if name.startswith("demo_")] if isinstance(demos, h5py.Group) else []
-            odd = [name for name in found if not name.removeprefix("demo_").isdecimal()]
+            members = [name for name in demos if name.startswith("demo_")] if isinstance(demos, h5py.Group) else []
+            odd = [name for name in members if not name.removeprefix("demo_").isdecimal()]
             if odd:
                 raise BadInput(f"episodes must be named data/demo_0, data/demo_1, …, got data/{odd[0]} in {path}")
-            names = [f"data/{name}" for name in sorted(found, key=lambda name: int(name.removeprefix("demo_")))]
+            names = [f"data/{name}" for name in sorted(members, key=lambda name: int(name.removeprefix("demo_")))]
             lacking = [name for name in names if "actions" not in file[name] or "obs" not in file[name]]
             if not names or lacking:
                 raise BadInput(

@@ -71,20 +71,20 @@ def find_videos(folders: Sequence[Path], n_episodes: int, what: str) -> EpisodeV
     """
     paths = []
     for folder in folders:
-        found: dict[int, Path] = {}
+        by_number: dict[int, Path] = {}
         for path in sorted(folder.iterdir()):
             name = _NAME.fullmatch(path.name if path.is_dir() else path.stem)
             if name is None or not (path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES):
                 continue
-            if (number := int(name[1])) in found:
-                raise BadInput(f"{path} and {found[number].name} are both of episode {number}; remove one")
-            found[number] = path
-        missing = [number for number in range(n_episodes) if number not in found]
-        if missing or len(found) > n_episodes:
+            if (number := int(name[1])) in by_number:
+                raise BadInput(f"{path} and {by_number[number].name} are both of episode {number}; remove one")
+            by_number[number] = path
+        missing = [number for number in range(n_episodes) if number not in by_number]
+        if missing or len(by_number) > n_episodes:
             raise BadInput(
                 f"{folder} must hold episode_0.mp4 (or a folder episode_0 of pictures) and so on, one for each of the "
                 f"{n_episodes} episodes of {what}; "
-                + (f"{len(missing)} are missing, the first is {missing[0]}" if missing else f"got {len(found)}")
+                + (f"{len(missing)} are missing, the first is {missing[0]}" if missing else f"got {len(by_number)}")
             )
-        paths.append(tuple(found[number] for number in range(n_episodes)))
+        paths.append(tuple(by_number[number] for number in range(n_episodes)))
     return EpisodeVideos(tuple(paths))

@@ -49,10 +49,10 @@ def summary(result: Mapping[str, Any]) -> str:
     """One line per sub-goal, as text."""
     lines = [
         f"  {name:<16} "
-        + ("never rises" if one["rises_at"] is None else f"rises at step {one['rises_at']:>3}")
-        + f", highest at {one['highest_at']:>3}"
-        + ("" if one["done_at"] is None else f", done at {one['done_at']:>3}")
-        for name, one in result["sub_goals"].items()
+        + ("never rises" if times["rises_at"] is None else f"rises at step {times['rises_at']:>3}")
+        + f", highest at {times['highest_at']:>3}"
+        + ("" if times["done_at"] is None else f", done at {times['done_at']:>3}")
+        for name, times in result["sub_goals"].items()
     ]
     return "\n".join(
         [
