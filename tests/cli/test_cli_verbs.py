@@ -16,7 +16,7 @@ from read_dataset import read
 from zest_rl.cli import collect as collect_verb
 from zest_rl.cli import follow, select, train
 from zest_rl.cli.config import parse_config
-from zest_rl.cli.reproduce.plan import read_plan
+from zest_rl.cli.reproduce.comparison import read_comparison
 from zest_rl.cli.reproduce.study import read_study
 from zest_rl.data import reader
 from zest_rl.data.reader import Dataset
@@ -198,14 +198,14 @@ def test_a_recipe_of_a_table_is_valid_and_found_from_anywhere(
         monkeypatch.setenv(variable, str(tmp_path))
     if "\nstudy = " in path.read_text():
         study = read_study(Path("eval") / path.name)
-        assert study.study.title
+        assert study.tables.title
         assert study.settings
-        assert bool(study.collect) == (study.study.study != "footage")
+        assert bool(study.collect) == (study.tables.study != "footage")
         return
-    plan = read_plan(Path("eval") / path.name)
-    assert plan.recipe.title
-    assert plan.methods.keys() == plan.recipe.methods.keys()
-    assert plan.collect
+    comparison = read_comparison(Path("eval") / path.name)
+    assert comparison.tables.title
+    assert comparison.methods.keys() == comparison.tables.methods.keys()
+    assert comparison.collect
 
 
 @pytest.mark.parametrize(

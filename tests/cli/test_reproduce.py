@@ -20,7 +20,8 @@ from read_dataset import read
 
 from zest_rl import cli
 from zest_rl.cli import reproduce
-from zest_rl.cli.reproduce.plan import TaskData, plan_cells, read_plan
+from zest_rl.cli.reproduce.cells import TaskDatasets, make_cells
+from zest_rl.cli.reproduce.comparison import read_comparison
 from zest_rl.data import reader
 from zest_rl.kitchen import calibration
 from zest_rl.report import methods
@@ -223,9 +224,9 @@ def test_whatever_a_result_depends_on_makes_a_cell_of_its_own(whole: Reproduced,
     goals = {"scene": next(name for name in reader.list_datasets() if "-zest-" in name)}
 
     def cells(old: str = "", new: str = "") -> dict[str, str]:
-        plan = read_plan(write(tmp_path, RECIPE.replace(old, new)))
-        planned = plan_cells(plan, {"micro": TaskData(source, goals)}, whole.output)
-        return {each.method: each.run.name for each in planned}
+        comparison = read_comparison(write(tmp_path, RECIPE.replace(old, new)))
+        made = make_cells(comparison, {"micro": TaskDatasets(source, goals)}, whole.output)
+        return {each.method: each.run.name for each in made}
 
     first = cells()
     assert all((whole.output / "cells" / name).is_dir() for name in first.values())
@@ -244,8 +245,9 @@ def test_the_flags_of_a_method_win_over_those_of_its_agent_and_these_over_the_sh
     text += '\n[methods."short DT"]\nagent = "dt"\ngoal = "scene"\nn_updates = 22\n'
     source = whole.result["tasks"]["micro"]["dataset"]["dataset"]
     goals = {"scene": next(name for name in reader.list_datasets() if "-zest-" in name)}
-    planned = plan_cells(read_plan(write(tmp_path, text)), {"micro": TaskData(source, goals)}, whole.output)
-    assert [(each.train["seed"], each.method, each.train["n_updates"]) for each in planned] == [
+    comparison = read_comparison(write(tmp_path, text))
+    made = make_cells(comparison, {"micro": TaskDatasets(source, goals)}, whole.output)
+    assert [(each.train["seed"], each.method, each.train["n_updates"]) for each in made] == [
         (3, "BC", 20), (3, "ZeST+DT", 21), (3, "short DT", 22), (1, "BC", 20), (1, "ZeST+DT", 21), (1, "short DT", 22),
     ], "all of the first seed come first"  # fmt: skip
 
@@ -265,17 +267,16 @@ def test_a_policy_that_was_trained_elsewhere_is_a_method_like_the_others(
     assert "policies from elsewhere are missing; train them, then go on:\n" in message
     assert f"'Theirs', trained on {goal} with seed 0: there is no file {tmp_path / 'micro-0.pt'}" in message
     torch.jit.trace(torch.nn.Linear(59, 9), torch.zeros(1, 59)).save(str(tmp_path / "micro-0.pt"))
-    config = reproduce.Config(recipe, output, n_workers=1)
-    first = reproduce.run(config, reproduce.SilentUi())
+    first = reproduce.reproduce(recipe, output, n_workers=1)
     assert first["n_cells_run"] == 1
     assert {name: row for name, row in first["rows"].items() if name != "Theirs"} == whole.result["rows"]
     row = first["rows"]["Theirs"]
     (run,) = (output / "cells").glob("micro-foreign-scene-seed0-*")
     assert artifacts.read_json(run / "meta.json")["name"] == "Theirs"
     assert (row["kind"], row["n_seeds"], row["n_episodes"]) == ("control", 1, 2)
-    assert reproduce.run(config, reproduce.SilentUi())["n_cells_run"] == 0
+    assert reproduce.reproduce(recipe, output, n_workers=1)["n_cells_run"] == 0
     torch.jit.trace(torch.nn.Linear(59, 9), torch.zeros(1, 59)).save(str(tmp_path / "micro-0.pt"))
-    assert reproduce.run(config, reproduce.SilentUi())["n_cells_run"] == 1, "another file is another policy"
+    assert reproduce.reproduce(recipe, output, n_workers=1)["n_cells_run"] == 1, "another file is another policy"
     assert len(list((output / "cells").glob("micro-foreign-scene-seed0-*"))) == 2
 
 
@@ -284,8 +285,8 @@ def test_one_task_may_have_several_datasets(tmp_path: Path) -> None:
         f"[tasks.at-{level}]\ntask = 'micro'\nlevel = {level}\ndataset = 'zest/at-{level}-v0'\n" for level in (60, 95)
     )
     shared = RECIPE.replace('task = "micro"\n', "").replace('dataset = "zest/kitchen-micro-whole-v0"\n', "")
-    plan = read_plan(write(tmp_path, shared.replace("[relabel]", f"{tables}\n[relabel]")))
-    assert {name: (config.task, config.level) for name, config in plan.collect.items()} == {
+    comparison = read_comparison(write(tmp_path, shared.replace("[relabel]", f"{tables}\n[relabel]")))
+    assert {name: (config.task, config.level) for name, config in comparison.collect.items()} == {
         "at-60": ("micro", 60.0),
         "at-95": ("micro", 95.0),
     }

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zest_rl.cli.reproduce.study import markdown, mean_over_tasks, read_study
+from zest_rl.cli.reproduce.study import read_study
+from zest_rl.cli.reproduce.study_tables import as_markdown, mean_over_tasks
 from zest_rl.errors import BadInput
 
 RECIPE = """
@@ -76,7 +77,7 @@ def test_a_study_selects_in_every_cell_and_puts_the_paper_beside(
     assert result["rows"][1]["mean"]["top_n_standard_error_of_repeats"] is None
     assert json.loads((tmp_path / "out" / "result.json").read_text())["rows"] == result["rows"]
     table = (tmp_path / "out" / "table.md").read_text()
-    assert table == markdown(result)
+    assert table == as_markdown(result)
     for line in ("| | micro | mean |", "| paper: SGSD, CLIP | 92.0 | 92.0 |", "| at random, pool single |"):
         assert line in table
     page = (tmp_path / "out" / "report.html").read_text()
@@ -135,7 +136,7 @@ def test_the_papers_mean_is_over_the_columns_that_are_shown() -> None:
         "mean": mean | {"top_n_standard_error_of_repeats": None},
     }
     result = {"rows": [row], "paper": {"here": {"oven": 40.0, "door": 90.0}, "elsewhere": {"door": 90.0}}}
-    table = markdown(result)
+    table = as_markdown(result)
     assert "| paper: here | 40.0 | 40.0 |" in table
     assert "elsewhere" not in table
 

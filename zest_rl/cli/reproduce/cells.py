@@ -1,0 +1,191 @@
+"""Task × method × training seed: each cell is trained and evaluated once, side by side with others, one core each."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from zest_rl.cli.config import load_config
+from zest_rl.cli.reproduce.comparison import Comparison, run_config
+from zest_rl.cli.ui import SilentUi, Ui
+from zest_rl.errors import BadInput
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from zest_rl.evaluation.evaluate import EvaluationConfig
+
+POLL_SECONDS = 2.0
+"""Between two looks at the logs of the trainings."""
+
+
+@dataclass(frozen=True)
+class TaskDatasets:
+    """The datasets of one task."""
+
+    source: str
+    """The collected one."""
+    relabeled: Mapping[str, str]
+    """Goal → the one relabeled by it."""
+    collect_result: Mapping[str, Any] = field(default_factory=dict)
+    """What `zest collect` tells of the source."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One method on one task with one training seed."""
+
+    task: str
+    method: str
+    run: Path
+    agent: str
+    """Or ``foreign``."""
+    train: Mapping[str, Any]
+    """Arguments of `zest train AGENT`, or of `zest adopt`."""
+    evaluate: Mapping[str, Any]
+    """Arguments of `zest evaluate`."""
+    evaluation: EvaluationConfig
+    """What these arguments mean."""
+
+    @property
+    def name(self) -> str:
+        """Name of the marker that says that it is done."""
+        from zest_rl.runtime.artifacts import hash_json
+
+        return f"{self.run.name}-{hash_json({**self.evaluate, 'run': '', 'n_workers': 1})[:8]}"
+
+
+def make_cells(comparison: Comparison, datasets: Mapping[str, TaskDatasets], output: Path) -> list[Cell]:
+    """Return one cell per task, method and seed; the run's folder is named by a hash of its data and all arguments.
+
+    All cells of the first seed come first: of what was cut short, a recipe with fewer seeds finds its cells done.
+
+    Raises:
+        BadInput: policies that were trained elsewhere are not there; all of them are named.
+    """
+    from zest_rl.agents.foreign import identify
+    from zest_rl.data.reader import open_dataset
+    from zest_rl.runtime import artifacts
+
+    described = {}
+    for dataset in (name for task in datasets.values() for name in (task.source, *task.relabeled.values())):
+        with open_dataset(dataset) as ds:
+            described[dataset] = ds.describe()
+    cells, problems = [], []
+    triples = product(comparison.tables.seeds, comparison.methods.items(), datasets.items())
+    for seed, (name, method), (task, of_task) in triples:
+        goal, agent = method.table.goal, method.table.agent_or_foreign
+        dataset = of_task.source if goal is None else of_task.relabeled[goal]
+        train = {**method.train, "dataset": dataset, "seed": seed}
+        if method.table.policy is not None:
+            policy = method.table.policy.replace("{task}", task).replace("{seed}", str(seed))
+            train |= {"policy": policy, "name": name}
+        arguments = asdict(load_config(run_config(agent), train, name))  # defaults are arguments, too
+        if method.table.policy is not None:
+            try:
+                arguments |= {"policy": identify(arguments["policy"], arguments["python"]).to_json()}
+            except BadInput as error:
+                problems.append(f"{name!r}, trained on {dataset} with seed {seed}: {error}")
+        digest = artifacts.hash_json([arguments, agent, described[dataset]])
+        run = output / "cells" / f"{task}-{agent}-{goal or 'ground-truth'}-seed{seed}-{digest[:8]}"
+        train |= {"run_dir": str(run)}
+        cells.append(Cell(task, name, run, agent, train, {**method.evaluate, "run": str(run)}, method.evaluation))
+    if problems:
+        raise BadInput("\n  ".join(["policies from elsewhere are missing; train them, then go on:", *problems]))
+    return cells
+
+
+def run_cells(cells: list[Cell], output: Path, ui: Ui, *, n_workers: int | None = None) -> int:
+    """Train and evaluate all cells that are not done; return how many were not."""
+    from zest_rl.runtime.parallel import cached_jobs
+
+    done_folder = output / "done"
+    open_cells = {cell.name: cell for cell in cells if not _is_done(cell, done_folder)}
+    n_updates = {cell.run: cell.train.get("n_updates", 0) for cell in open_cells.values()}
+    with (
+        ui.progress("updates of all cells (evaluation follows)", sum(n_updates.values())) as advance,
+        _followed(n_updates.keys(), advance),
+    ):
+        for name in cached_jobs(_train_and_evaluate, open_cells, done_folder, n_workers=n_workers):
+            ui.say(f"done: {name}")
+    return len(open_cells)
+
+
+def _is_done(cell: Cell, folder: Path) -> bool:
+    """Whether a cell's results are there; a marker without them is removed, so that the cell is run again."""
+    from zest_rl.evaluation.evaluate import evaluation_folder
+    from zest_rl.training.checkpoints import snapshots
+
+    marker = folder / f"{cell.name}.npz"
+    policies = (cell.run, *snapshots(cell.run))
+    results = [evaluation_folder(policy, cell.evaluation) / "result.json" for policy in policies]
+    if not all(path.exists() for path in (cell.run / "meta.json", *results)):
+        marker.unlink(missing_ok=True)
+    return marker.exists()
+
+
+def _train_and_evaluate(cell: Cell) -> dict[str, NDArray[np.float64]]:
+    import numpy as np
+
+    from zest_rl.agents.foreign import FOREIGN
+    from zest_rl.cli import adopt, evaluate, train
+    from zest_rl.training.checkpoints import snapshots
+
+    make_run = adopt.run if cell.agent == FOREIGN else train.run
+    make_run(load_config(run_config(cell.agent), cell.train, cell.method), SilentUi())
+    trained = time.monotonic()
+    for run in (cell.run, *snapshots(cell.run)):
+        evaluate.run(load_config(evaluate.Config, {**cell.evaluate, "run": str(run)}, cell.method), SilentUi())
+    return {"evaluate_seconds": np.array(time.monotonic() - trained)}
+
+
+@contextmanager
+def _followed(runs: Collection[Path], advance: Callable[[int], object]) -> Iterator[None]:
+    """Show the updates that other processes log in `runs`, for as long as the context is open."""
+    stop, shown = threading.Event(), 0
+
+    def show() -> None:
+        nonlocal shown
+        n_done = sum(map(_updates_done, runs))
+        if n_done > shown:
+            advance(n_done - shown)
+            shown = n_done
+
+    def follow() -> None:
+        while not stop.wait(POLL_SECONDS):
+            show()
+
+    thread = threading.Thread(target=follow, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+        show()
+
+
+def _updates_done(run: Path) -> int:
+    try:
+        rows = (run / "metrics.csv").read_text().splitlines()
+        return int(rows[-1].split(",")[rows[0].split(",").index("update")])
+    except (OSError, IndexError, ValueError):
+        return 0
+
+
+def seconds_of(cell: Cell, output: Path) -> dict[str, float]:
+    """Return how long training and evaluating a finished cell took."""
+    from zest_rl.runtime import artifacts
+    from zest_rl.runtime.arrays import read_arrays
+
+    meta = artifacts.read_json(cell.run / "meta.json")
+    times = {"train_seconds": meta["train_seconds"]} if "train_seconds" in meta else {}
+    times |= read_arrays(output / "done" / f"{cell.name}.npz") or {}
+    return {name: round(float(value), 1) for name, value in times.items()}

@@ -1,0 +1,168 @@
+"""A recipe that compares methods → datasets, cells, result.json, table.md, and a page per task and over all."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from zest_rl.cli.reproduce.cells import Cell, TaskDatasets, make_cells, run_cells, seconds_of
+from zest_rl.cli.reproduce.comparison import Comparison, read_comparison
+from zest_rl.cli.reproduce.tables import as_markdown
+from zest_rl.cli.ui import Ui
+
+if TYPE_CHECKING:
+    from zest_rl.kitchen.videos import Video
+    from zest_rl.report.methods import Method
+    from zest_rl.report.sections import Report
+
+
+def run_comparison(path: Path, output: Path, ui: Ui, *, n_workers: int | None = None) -> dict[str, Any]:
+    """Collect, relabel, train, evaluate and report what is not done yet."""
+    from zest_rl.cli import inspect
+    from zest_rl.kitchen.videos import ensure_videos, missing
+    from zest_rl.report.html import write_report
+    from zest_rl.runtime import artifacts
+
+    comparison = read_comparison(path)
+    datasets = {task: _make_datasets(comparison, task, n_workers, ui) for task in comparison.collect}
+    if not comparison.methods:
+        relabeled = tuple(dataset for of_task in datasets.values() for dataset in of_task.relabeled.values())
+        inspected = inspect.run(inspect.Config(relabeled, output / "report.html", n_workers), ui)
+        artifacts.write_json(output / "result.json", {**inspected, "provenance": artifacts.provenance()})
+        return inspected
+    cells = make_cells(comparison, datasets, output)
+    ui.say(f"[3/4] train and evaluate {len(cells)} cells in {output / 'cells'}")
+    n_run = run_cells(cells, output, ui, n_workers=n_workers)
+    ui.say("[4/4] report")
+    videos: list[Video] = []
+    details = {"recipe": {"file": path.name, **asdict(comparison.tables)}}
+    task_pages, page = _pages(comparison, cells, datasets, details, videos)
+    result = {
+        "rows": _rows(page),
+        "tasks": {
+            task: {
+                "rows": _rows(task_page),
+                "spearman_of_zest_and_true_returns": _rank_correlations(task_page),
+                "dataset": datasets[task].collect_result,
+            }
+            for task, task_page in task_pages.items()
+        },
+        "seeds": list(comparison.tables.seeds),
+        "seconds_by_cell": {cell.name: seconds_of(cell, output) for cell in cells},
+        "provenance": artifacts.provenance(),
+    }
+    artifacts.write_json(output / "result.json", result)
+    artifacts.write_bytes(output / "table.md", as_markdown(result).encode())
+    with ui.progress("videos", len(missing(videos))) as advance:
+        ensure_videos(videos, n_workers=n_workers, on_done=advance)
+    if len(task_pages) > 1:
+        for task, task_page in task_pages.items():
+            write_report(task_page, output / f"{task}.html")
+    html = write_report(page, output / "report.html")
+    if n_run == 0:
+        ui.say("all cells were done already")
+    return {
+        **result,
+        "report": str(html),
+        "result": str(output / "result.json"),
+        "n_cells_run": n_run,
+        "next": f"open {html} in a browser",
+    }
+
+
+def _make_datasets(comparison: Comparison, task: str, n_workers: int | None, ui: Ui) -> TaskDatasets:
+    """Collect and relabel."""
+    from zest_rl.cli import collect, relabel
+
+    ui.say(f"[1/4] collect {task}")
+    collected = collect.run(replace(comparison.collect[task], n_workers=n_workers), ui)
+    relabeled = {}
+    for name, config in comparison.relabel.items():
+        ui.say(f"[2/4] relabel {task} by goal {name!r}")
+        made = relabel.run(replace(config, dataset=collected["dataset"], n_workers=n_workers), ui)
+        relabeled[name] = made["dataset"]
+    facts = {key: value for key, value in collected.items() if key not in ("path", "next")}
+    return TaskDatasets(collected["dataset"], relabeled, facts)
+
+
+def _pages(
+    comparison: Comparison,
+    cells: Sequence[Cell],
+    datasets: Mapping[str, TaskDatasets],
+    details: dict[str, Any],
+    videos: list[Video],
+) -> tuple[dict[str, Report], Report]:
+    """Build the page of each task, and the one over all; `videos` takes up what they show and nobody has written."""
+    from zest_rl.report.comparison_page import compare, overview
+
+    def film(video: Video) -> Path:
+        videos.append(video)
+        return video.path
+
+    tables = comparison.tables
+    shared: dict[str, Any] = {"paper_demo": tables.paper_demo, "caveats": tables.caveats}
+    methods = {task: _methods(comparison, cells, task) for task in datasets}
+    pages = {
+        task: compare(
+            tables.title if len(datasets) == 1 else f"{tables.title}: {task}",
+            methods[task],
+            source_id=of_task.source,
+            goals=dict(of_task.relabeled),
+            details={**details, "collected": of_task.collect_result},
+            film=film,
+            **shared,
+        )
+        for task, of_task in datasets.items()
+    }
+    if len(pages) == 1:
+        return pages, next(iter(pages.values()))
+    files = {task: f"{task}.html" for task in pages}
+    sources = [of_task.source for of_task in datasets.values()]
+    return pages, overview(tables.title, methods, pages, files, sources=sources, details=details, **shared)
+
+
+def _methods(comparison: Comparison, cells: Sequence[Cell], task: str) -> list[Method]:
+    from zest_rl.report.methods import Method
+
+    return [
+        Method(
+            name,
+            tuple(cell.run for cell in cells if (cell.task, cell.method) == (task, name)),
+            method.table.kind,
+            method.table.note,
+            method.table.paper,
+            method.evaluation,
+        )
+        for name, method in comparison.methods.items()
+    ]
+
+
+def _rows(page: Report) -> dict[str, Any]:
+    from zest_rl.report.sections import Results
+
+    return {
+        row.method: {
+            "normalized_return": row.mean,
+            "ci95": [row.ci_low, row.ci_high],
+            "iqm": row.iqm,
+            "success": row.success_rate,
+            "n_seeds": row.n_seeds,
+            "n_episodes": row.n_episodes,
+            "paper": row.paper_value,
+            "kind": row.kind,
+        }
+        for row in page.items(Results)
+    }
+
+
+def _rank_correlations(page: Report) -> dict[str, Any]:
+    """Return Spearman's ρ of ZeST and true returns by goal; None where it is undefined."""
+    from zest_rl.report.sections import Ranking
+
+    return {
+        scatter.name: None if math.isnan(scatter.spearman) else {"value": scatter.spearman, "ci95": scatter.ci}
+        for scatter in page.items(Ranking)
+    }

@@ -1,0 +1,48 @@
+"""The results of a comparison as text: for the terminal, and for a README."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def as_text(result: Mapping[str, Any]) -> str:
+    """Write the table, the figures of each task, and how well scores rank its episodes."""
+    lines = [
+        f"{'':<28}{'% of expert':>12}  {'95 % interval':<18}{'success':>8}{'seeds':>7}{'episodes':>10}{'paper':>8}"
+    ]
+    for name, row in result["rows"].items():
+        low, high = row["ci95"]
+        paper = "–" if row["paper"] is None else f"{row['paper']:.2f}"
+        lines.append(
+            f"{name:<28}{row['normalized_return']:>12.2f}  {f'[{low:.2f}, {high:.2f}]':<18}{row['success']:>8.0%}"
+            f"{row['n_seeds']:>7}{row['n_episodes']:>10}{paper:>8}"
+        )
+    if len(result["tasks"]) > 1:
+        for task, of_task in result["tasks"].items():
+            figures = (f"{name} {row['normalized_return']:.1f}" for name, row in of_task["rows"].items())
+            lines.append(f"{task}: {', '.join(figures)}")
+    for task, of_task in result["tasks"].items():
+        for name, rho in of_task["spearman_of_zest_and_true_returns"].items():
+            value = "undefined" if rho is None else f"{rho['value']:.3f}"
+            lines.append(f"{task}, goal {name}: Spearman ρ of ZeST and true returns {value}")
+    return "\n".join(
+        [*lines, f"report: {result['report']}", f"{result['n_cells_run']} cells run, {result['seconds']} s"]
+    )
+
+
+def as_markdown(result: Mapping[str, Any]) -> str:
+    """Write the table for a README: all tasks together, then one column per task."""
+    tasks = list(result["tasks"]) if len(result["tasks"]) > 1 else []
+    lines = [
+        "| | % of the expert | 95 % interval | " + "".join(f"{task} | " for task in tasks) + "paper |",
+        "|---|---|---|" + "---|" * (len(tasks) + 1),
+    ]
+    for name, row in result["rows"].items():
+        low, high = row["ci95"]
+        of_tasks = (f"{result['tasks'][task]['rows'][name]['normalized_return']:.1f} | " for task in tasks)
+        paper = "–" if row["paper"] is None else f"{row['paper']:.2f}"
+        lines.append(
+            f"| {name} | {row['normalized_return']:.2f} | {low:.1f} to {high:.1f} | {''.join(of_tasks)}{paper} |"
+        )
+    return "\n".join(lines) + "\n"
