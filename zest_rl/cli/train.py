@@ -37,13 +37,13 @@ def _with_arguments(agent: str, agent_class: type[Any]) -> type[Any]:
     from zest_rl.training.loop import TrainingConfig
 
     summary = f"Train {(agent_class.__doc__ or agent).splitlines()[0]}"
-    members = {"agent": agent, "__doc__": summary, "__annotations__": {}, "__post_init__": _parts}  # parts check values
+    members = {"agent": agent, "__doc__": summary, "__annotations__": {}, "__post_init__": split_config}
     bases = (Arguments, TrainingConfig, agent_class)
     return dataclass(frozen=True, kw_only=True)(type(f"{agent_class.__name__}Arguments", bases, members))
 
 
-def _parts(config: Any) -> tuple[Any, Any]:
-    """Return the agent's config and the `TrainingConfig` out of the flags."""
+def split_config(config: Any) -> tuple[Any, Any]:
+    """Return the agent's config and the `TrainingConfig` that flags stand for; both check their values."""
     from zest_rl.agents import AGENTS
     from zest_rl.training.loop import TrainingConfig
 
@@ -60,7 +60,7 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
     from zest_rl.training.runs import default_run_dir, train
 
     ui = ui if launched().leads else SilentUi()
-    agent_config, training = _parts(config)
+    agent_config, training = split_config(config)
     run_dir = config.run_dir or default_run_dir(config.agent, config.dataset, training.seed)
     ui.say(f"training in {run_dir}")
     with ui.progress(f"{config.agent} updates", training.n_updates) as advance:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from zest_rl.cli.config import load_config
 from zest_rl.cli.reproduce.comparison import Comparison, run_config
-from zest_rl.cli.ui import SilentUi, Ui
+from zest_rl.cli.ui import Ui
 from zest_rl.errors import BadInput
 
 if TYPE_CHECKING:
@@ -135,14 +135,22 @@ def _train_and_evaluate(cell: Cell) -> dict[str, NDArray[np.float64]]:
     import numpy as np
 
     from zest_rl.agents.foreign import FOREIGN
-    from zest_rl.cli import adopt, evaluate, train
+    from zest_rl.cli.evaluate import Config as EvaluateFlags
+    from zest_rl.cli.train import split_config
+    from zest_rl.evaluation.evaluate import evaluate
+    from zest_rl.training.adoption import adopt
     from zest_rl.training.checkpoints import snapshots
+    from zest_rl.training.runs import train
 
-    make_run = adopt.run if cell.agent == FOREIGN else train.run
-    make_run(load_config(run_config(cell.agent), cell.train, cell.method), SilentUi())
+    flags = load_config(run_config(cell.agent), cell.train, cell.method)
+    if cell.agent == FOREIGN:
+        adopt(flags.policy, flags.dataset, name=flags.name, seed=flags.seed, python=flags.python, run_dir=flags.run_dir)
+    else:
+        train(cell.agent, flags.dataset, *split_config(flags), run_dir=flags.run_dir)
     trained = time.monotonic()
+    how = load_config(EvaluateFlags, cell.evaluate, cell.method)
     for run in (cell.run, *snapshots(cell.run)):
-        evaluate.run(load_config(evaluate.Config, {**cell.evaluate, "run": str(run)}, cell.method), SilentUi())
+        evaluate(run, cell.evaluation, score=how.score, videos=how.videos, device=how.device, n_workers=how.n_workers)
     return {"evaluate_seconds": np.array(time.monotonic() - trained)}
 
 
