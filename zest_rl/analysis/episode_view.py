@@ -22,7 +22,7 @@ N_FRAMES = 8
 
 @dataclass(frozen=True)
 class EpisodeView:
-    """How the score sees one episode; what nobody asks for is neither rendered nor scored."""
+    """What the scorer sees of one episode; frames and scores are made when they are first asked for."""
 
     scorer: StateScorer
     """Of the dataset."""
@@ -67,7 +67,7 @@ class EpisodeView:
 def best_and_worst(inspection: Inspection, *, n_workers: int | None = None) -> dict[str, EpisodeView]:
     """Return views of the episodes with the highest and the lowest return: "best" and "worst".
 
-    None where scores were shuffled, or where the frames were not rendered by us.
+    Empty where scores were shuffled, or where frames were not rendered from kitchen states.
 
     Args:
         inspection: of a dataset.

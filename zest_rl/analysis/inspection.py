@@ -106,7 +106,7 @@ def _over_time(rewards: list[FloatArray], truth: list[GroundTruth] | None) -> di
 
 
 def _mean_by_step(rewards: Sequence[FloatArray]) -> FloatArray:
-    """Mean over those episodes that are long enough: (T of the longest,)."""
+    """Mean at each step over the episodes that last so long: (T of the longest,)."""
     total, count = np.zeros(max(map(len, rewards))), np.zeros(max(map(len, rewards)))
     for episode in rewards:
         total[: len(episode)] += episode
@@ -115,13 +115,13 @@ def _mean_by_step(rewards: Sequence[FloatArray]) -> FloatArray:
 
 
 def labels(inspections: Sequence[Inspection]) -> list[str]:
-    """Name each by task and goal, and by the settings that tell it from others of the same task and goal."""
+    """Name each by its task and goal, and by the settings that differ among datasets of the same task and goal."""
     described = [(f"{each.task} by {_goal(each)}", _settings(each)) for each in inspections]
     names = []
     for name, settings in described:
         rivals = [other for other_name, other in described if other_name == name]
-        telling = [key for key in settings if any(other[key] != settings[key] for other in rivals)]
-        names.append(", ".join([name, *(f"{key} {settings[key]}" for key in telling)]))
+        differing = [(k, v) for k, v in settings.items() if any(other[k] != v for other in rivals)]
+        names.append(", ".join([name, *(f"{k} {v}" for k, v in differing)]))
     return [
         f"{name} ({each.dataset_id})" if names.count(name) > 1 else name
         for name, each in zip(names, inspections, strict=True)

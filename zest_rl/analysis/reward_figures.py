@@ -121,30 +121,32 @@ def warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimate]) -> 
     every = np.concatenate(rewards)
     if np.ptp(every) <= FLAT * np.abs(every).max():
         return ["All frames score the same: this goal and embedder tell nothing apart. Look at the goal's pictures."]
-    found = []
+    sentences = []
     if np.ptp(reward_quality.returns_of(rewards)) == 0:
-        found.append("All episodes have the same return: there is nothing to condition a Decision Transformer on.")
+        sentences.append("All episodes have the same return: there is nothing to condition a Decision Transformer on.")
     if "contradictory" in figures and figures["contradictory"].value >= CONTRADICTORY:
-        found.append(
+        sentences.append(
             f"{figures['contradictory'].value:.0%} of the frames score otherwise than an equal frame of the same "
             "episode: these scores are not of these episodes (shuffled?)."
         )
     if figures["told_by_step"].value >= CLOCK:
-        found.append("The number of the step alone tells the score: the reward is a clock, whatever the robot does.")
+        sentences.append(
+            "The number of the step alone tells the score: the reward is a clock, whatever the robot does."
+        )
     elif figures["straight_in_time"].value >= STRAIGHT:
-        found.append(
+        sentences.append(
             "In every episode, good or bad, the score is nearly proportional to time: it may tell how long the robot "
             "has moved rather than how near the goal is."
         )
     if figures["saturated"].value >= SATURATED:
-        found.append("Nearly all frames score next to the lowest or the highest: most progress is not rewarded.")
+        sentences.append("Nearly all frames score next to the lowest or the highest: most progress is not rewarded.")
     if "still" in figures and figures["still"].value >= STILL:
-        found.append("Most frames show what the first one shows: nothing moves, or the cameras do not see it.")
+        sentences.append("Most frames show what the first one shows: nothing moves, or the cameras do not see it.")
     rho = figures.get("spearman")
     if rho is not None and not rho.low > 0:  # also when it is NaN
         against = " The higher the return, the worse the episode." if rho.high < 0 else ""
-        found.append(
+        sentences.append(
             f"The returns do not rank the episodes as the true ones do: ρ = {rho.value:.2f}, "
             f"95 % interval {rho.low:.2f} to {rho.high:.2f}.{against}"
         )
-    return found
+    return sentences

@@ -83,13 +83,12 @@ def return_curve(method: Method) -> Curve | None:
     columns: list[dict[int, float]] = []
     for run in method.runs:
         config = method.evaluation or latest_evaluation(run).config
-        found = {policy: evaluation_folder(policy, config) for policy in (*snapshots(run), run)}
-        returns = {
-            policy: float(read_evaluation(folder).normalized().mean())
-            for policy, folder in found.items()
-            if (folder / "result.json").exists()
-        }
-        columns.append({read_meta(policy)["n_updates"]: value for policy, value in returns.items()})
+        column = {}
+        for policy in (*snapshots(run), run):
+            folder = evaluation_folder(policy, config)
+            if (folder / "result.json").exists():
+                column[read_meta(policy)["n_updates"]] = float(read_evaluation(folder).normalized().mean())
+        columns.append(column)
     steps = sorted(set.intersection(*(set(column) for column in columns)))
     if len(steps) < 2:
         return None

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +24,35 @@ def episode_panels(name: str, evaluation: Evaluation, scorer: StateScorer | None
     for which, index in statistics.representative(evaluation.normalized()).items():
         states: NDArray[np.float64] = evaluation.traces["qpos"][index]
         video = film(Video(states, folder / f"{which}.mp4"))
-        panel = _panel(f"{name}: {which}", name, evaluation, index, video)
-        panels.append(replace(panel, scores=None if scorer is None else scorer.score_episode(states)))
+        scores = None if scorer is None else scorer.score_episode(states)
+        panels.append(_panel(f"{name}: {which}", name, evaluation, index, video, scores=scores))
     return panels
 
 
-def _panel(title: str, name: str, evaluation: Evaluation, index: int, video: Path) -> EpisodePanel:
+def paired_panels(left: tuple[str, Evaluation], right: tuple[str, Evaluation], film: Film) -> list[EpisodePanel]:
+    """Two policies on the same start side by side: where the right one gains most, as usual, and least.
+
+    Args:
+        left: name and evaluation of one policy.
+        right: of the other; without equal starts there is nothing to pair, and the list is empty.
+        film: makes the videos.
+    """
+    (left_name, before), (right_name, after) = left, right
+    if before.config.starts != after.config.starts:
+        return []
+    panels = []
+    returns = before.normalized()
+    for which, index in statistics.representative(after.normalized() - returns).items():
+        left_qpos, right_qpos = before.traces["qpos"][index], after.traces["qpos"][index]
+        name = f"pair-{artifacts.hash_arrays(left_qpos, right_qpos)[:8]}.mp4"
+        video = film(Video(left_qpos, evaluation_folder(after.run, after.config) / name, beside=right_qpos))
+        title = f"{left_name} (left, {returns[index]:.0f} %) beside {right_name} (right): {which} gain"
+        beside = (left_name, _progress(before, index))
+        panels.append(_panel(title, right_name, after, index, video, beside=beside))
+    return panels
+
+
+def _panel(title: str, name: str, evaluation: Evaluation, index: int, video: Path, **drawn: Any) -> EpisodePanel:
     return EpisodePanel(
         title=title,
         method=name,
@@ -39,31 +62,9 @@ def _panel(title: str, name: str, evaluation: Evaluation, index: int, video: Pat
         video=video,
         fps=FPS,
         gt_progress=_progress(evaluation, index),
+        **drawn,
     )
 
 
 def _progress(evaluation: Evaluation, index: int) -> FloatArray:
     return np.asarray(evaluation.traces["gt_reward"][index], dtype=np.float32)
-
-
-def paired_panels(left: tuple[str, Evaluation], right: tuple[str, Evaluation], film: Film) -> list[EpisodePanel]:
-    """Two policies on the same start side by side: where the right one gains most, gains as it mostly does, and least.
-
-    Args:
-        left: name and evaluation of one policy.
-        right: of the other; without equal starts there is nothing to pair, and the list is empty.
-        film: makes the videos.
-    """
-    (left_name, one), (right_name, other) = left, right
-    if one.config.starts != other.config.starts:
-        return []
-    panels = []
-    before, after = one.normalized(), other.normalized()
-    for which, index in statistics.representative(after - before).items():
-        before_qpos, after_qpos = one.traces["qpos"][index], other.traces["qpos"][index]
-        name = f"pair-{artifacts.hash_arrays(before_qpos, after_qpos)[:8]}.mp4"
-        video = film(Video(before_qpos, evaluation_folder(other.run, other.config) / name, beside=after_qpos))
-        title = f"{left_name} (left, {before[index]:.0f} %) beside {right_name} (right): {which} gain"
-        panel = _panel(title, right_name, other, index, video)
-        panels.append(replace(panel, beside=(left_name, _progress(one, index))))
-    return panels

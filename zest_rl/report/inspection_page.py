@@ -1,4 +1,4 @@
-"""Inspected datasets → one page: all figures side by side, the episodes behind them, and which task each goal is of."""
+"""Inspected datasets → one page: their figures side by side, their episodes, which task each goal scores highest."""
 
 from __future__ import annotations
 

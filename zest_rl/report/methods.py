@@ -54,9 +54,9 @@ def methods_of_runs(runs: Sequence[Path]) -> tuple[Method, ...]:
     for run in runs:
         meta = read_meta(run)
         dataset = f"{meta['dataset']['id']} ({meta['data_sha256'][:8]})"
-        own = {"name": _short_name(meta), **meta["config"], "n_updates": meta["n_updates"], "dataset": dataset}
-        key = artifacts.hash_json(own)
-        settings[key] = own
+        of_run = {"name": _short_name(meta), **meta["config"], "n_updates": meta["n_updates"], "dataset": dataset}
+        key = artifacts.hash_json(of_run)
+        settings[key] = of_run
         earlier = groups.setdefault(key, {}).setdefault(meta["seed"], run)
         if earlier != run:
             raise BadInput(
@@ -64,12 +64,11 @@ def methods_of_runs(runs: Sequence[Path]) -> tuple[Method, ...]:
                 + (", or tell them apart by --name or --seed of `zest adopt`" if meta["agent"] == FOREIGN else "")
             )
     methods = []
-    for group, seeds in groups.items():
-        own = settings[group]
-        others = [other for other in settings.values() if other["name"] == own["name"]]
-        telling = [key for key in own if any(other.get(key) != own[key] for other in others)]
-        name = ", ".join([own["name"], *(f"{key} {own[key]}" for key in telling)])
-        methods.append(Method(name, tuple(seeds.values())))
+    for key, seeds in groups.items():
+        name = settings[key]["name"]
+        rivals = [other for other in settings.values() if other["name"] == name]
+        differing = [(k, v) for k, v in settings[key].items() if any(other.get(k) != v for other in rivals)]
+        methods.append(Method(", ".join([name, *(f"{k} {v}" for k, v in differing)]), tuple(seeds.values())))
     return tuple(methods)
 
 
