@@ -389,6 +389,8 @@ def browser(tmp_path: Path, report: Report) -> Iterator[Browser]:
     browser = Browser(tmp_path / "profile")
     try:
         browser.resize(1200)
+        # A smooth scroll that still goes on would move what a mouse event is aimed at.
+        browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-reduced-motion", "value": "reduce"}])
         browser.open(write_report(report, tmp_path / "out" / "report.html"))
         yield browser
     finally:
