@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -79,6 +80,13 @@ def test_without_a_camera_frames_are_those_that_the_environment_renders(env_id: 
     ours = [views[0] for views in source.frames.read(0)]
     np.testing.assert_array_equal(ours, rendered(env_id, None, episode, seed=0))
     assert max(np.std(frame) for frame in ours) > 10, "it shows something"
+
+
+def test_a_process_that_has_made_no_environment_yet_renders_one(maze: list[Episode]) -> None:
+    dataset = write_states("maze/random-v0", "PointMaze_UMaze-v3", maze[:1])
+    code = "from zest_rl.sources import open_source; frames = open_source(f).frames; print(len(list(frames.read(0))))"
+    done = subprocess.run([sys.executable, "-c", f"f = {dataset!r}; {code}"], capture_output=True, text=True)
+    assert done.stdout == f"{LENGTHS[0] + 1}\n", done.stderr
 
 
 def test_the_environments_own_camera_stays_where_it_stood_at_first_and_embeddings_depend_on_it() -> None:

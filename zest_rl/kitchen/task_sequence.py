@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
 import gymnasium
 import mujoco
 import numpy as np

@@ -12,11 +12,12 @@ from contextlib import redirect_stderr
 from io import StringIO
 from typing import Any
 
-import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
+import zest_rl.runtime.load_order  # isort: skip
 import gymnasium
 import mujoco
 import numpy as np
 
+import zest_rl.kitchen.env  # noqa: F401  # registers its environment, and those of gymnasium-robotics
 from zest_rl.data.env_specs import check_registered
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime import artifacts
