@@ -126,7 +126,6 @@ def test_the_version_is_the_package_s(capsys: pytest.CaptureFixture[str]) -> Non
         (["toy", "d", "--similarity", "dot"], "--similarity must be one of 'cos', 'l2', got 'dot'"),
         (["toy", "d", "e"], "unexpected 'e'"),
         (["toy", "d", "--noise"], "argument --noise: expected 1 argument"),
-        (["toy", "d", "--n-episodes", "x", "--size", "1", "2", "--nose", "1"], "must be an integer, got 'x'"),
         (["toy", "d", "--n-episodes", "0"], "error: n-episodes must be at least 1, got 0\n"),
         (["toy", "d", "--recipe"], "--recipe needs a file"),
     ],
@@ -280,6 +279,40 @@ def test_a_recipe_supplies_defaults_and_flags_win(tmp_path: Path) -> None:
     config, as_json = parse_config(Config, ["e", f"--recipe={recipe}", "--n_episodes", "8", "--json", "--video"], "toy")
     assert (config.dataset, config.n_episodes, config.noise, config.video) == ("e", 8, 1.0, True)
     assert as_json
+
+
+def test_flags_mean_what_the_help_says() -> None:
+    words = [
+        "--noise=-0.5",
+        "--out",
+        "None",
+        "--views",
+        "4",
+        "--no-video",
+        "--size",
+        "1",
+        "2",
+        "--n-episodes",
+        "8",
+        "d",
+    ]
+    config, _ = parse_config(Config, words, "toy")
+    assert config == Config("d", n_episodes=8, noise=-0.5, views=(4,), size=(1, 2))
+    config, _ = parse_config(Config, ["d", "--noise", "-2", "--views", "--video"], "toy")
+    assert config == Config("d", noise=-2.0, views=(), video=True)
+
+
+def test_all_problems_of_a_command_line_are_reported_at_once() -> None:
+    with pytest.raises(BadInput) as caught:
+        parse_config(Config, ["--n-episodes", "x", "--size", "1", "b", "--nose", "--similarity=dot"], "toy")
+    assert str(caught.value).splitlines() == [
+        "zest toy: unknown flag '--nose'; did you mean '--noise' or '--size' or '--out'? valid: --n-episodes, "
+        "--noise, --out, --similarity, --size, --video, --views",
+        "  --n-episodes must be an integer, got 'x'",
+        "  --size must be a list [an integer, an integer], got '1 b'",
+        "  --similarity must be one of 'cos', 'l2', got 'dot'",
+        "  DATASET is required",
+    ]
 
 
 def test_help_shows_the_recipe_s_values_as_the_defaults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -198,9 +198,9 @@ def select_clips(
     embeddings, goal_embeddings = vectors[: len(clips)], vectors[-len(goal_clips) :]
     objects = {}
     for thing in things:
-        of_thing = [i for i, clip in enumerate(goal_clips) if clip.thing == thing]
+        goal_indices = [i for i, clip in enumerate(goal_clips) if clip.thing == thing]
         tops, variations, ratios, picked = [], [], [], []
-        for repeat, goal in enumerate(np.random.default_rng(0).permutation(of_thing)[:n_repeats].tolist()):
+        for repeat, goal in enumerate(np.random.default_rng(0).permutation(goal_indices)[:n_repeats].tolist()):
             frames = candidates(
                 clips,
                 embeddings,

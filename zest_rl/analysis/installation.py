@@ -64,14 +64,14 @@ def check_packages() -> Iterator[Check]:
     for requirement in core:
         fix = f"pip install '{requirement}'"
         try:
-            found = importlib.metadata.version(requirement.name)
+            installed = importlib.metadata.version(requirement.name)
         except importlib.metadata.PackageNotFoundError:
             n_wrong += 1
             yield Check(f"package {requirement.name}", "fail", "is not installed", fix)
             continue
-        if not requirement.specifier.contains(found, prereleases=True):
+        if not requirement.specifier.contains(installed, prereleases=True):
             n_wrong += 1
-            yield Check(f"package {requirement.name}", "fail", f"{found}, needs {requirement.specifier}", fix)
+            yield Check(f"package {requirement.name}", "fail", f"{installed}, needs {requirement.specifier}", fix)
     if not n_wrong:
         versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("torch", "mujoco", "minari"))
         yield Check("packages", "ok", f"all {len(core)} as required ({versions})")
@@ -123,13 +123,13 @@ def check_weights() -> Iterator[Check]:
     from zest_rl.runtime.artifacts import hash_file
 
     weights = next(file for file in importlib.metadata.files(WEIGHTS) or [] if file.suffix == ".pth")
-    found = hash_file(Path(str(weights.locate())))
-    published = base64.urlsafe_b64decode(f"{weights.hash.value}=").hex() if weights.hash else found
-    if found != published:
-        yield Check("weights", "fail", f"{weights} has sha256 {found[:12]}…, not {published[:12]}…", FIXES["weights"])
+    sha256 = hash_file(Path(str(weights.locate())))
+    published = base64.urlsafe_b64decode(f"{weights.hash.value}=").hex() if weights.hash else sha256
+    if sha256 != published:
+        yield Check("weights", "fail", f"{weights} has sha256 {sha256[:12]}…, not {published[:12]}…", FIXES["weights"])
         return
     vectors = load_embedder(DEFAULT_EMBEDDER).embed_images([np.zeros((224, 224, 3), np.uint8)])
-    yield Check("weights", "ok", f"{DEFAULT_EMBEDDER}, {vectors.shape[1]} dimensions, sha256 {found[:12]}…")
+    yield Check("weights", "ok", f"{DEFAULT_EMBEDDER}, {vectors.shape[1]} dimensions, sha256 {sha256[:12]}…")
 
 
 def check_processor() -> Iterator[Check]:

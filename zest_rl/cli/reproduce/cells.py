@@ -80,9 +80,9 @@ def make_cells(comparison: Comparison, datasets: Mapping[str, TaskDatasets], out
             described[dataset] = ds.describe()
     cells, problems = [], []
     triples = product(comparison.tables.seeds, comparison.methods.items(), datasets.items())
-    for seed, (name, method), (task, of_task) in triples:
+    for seed, (name, method), (task, task_datasets) in triples:
         goal, agent = method.table.goal, method.table.agent_or_foreign
-        dataset = of_task.source if goal is None else of_task.relabeled[goal]
+        dataset = task_datasets.source if goal is None else task_datasets.relabeled[goal]
         train = {**method.train, "dataset": dataset, "seed": seed}
         if method.table.policy is not None:
             policy = method.table.policy.replace("{task}", task).replace("{seed}", str(seed))

@@ -29,7 +29,9 @@ def run_comparison(path: Path, output: Path, ui: Ui, *, n_workers: int | None = 
     comparison = read_comparison(path)
     datasets = {task: _make_datasets(comparison, task, n_workers, ui) for task in comparison.collect}
     if not comparison.methods:
-        relabeled = tuple(dataset for of_task in datasets.values() for dataset in of_task.relabeled.values())
+        relabeled = tuple(
+            dataset_id for task_datasets in datasets.values() for dataset_id in task_datasets.relabeled.values()
+        )
         inspected = inspect.run(inspect.Config(relabeled, output / "report.html", n_workers), ui)
         artifacts.write_json(output / "result.json", {**inspected, "provenance": artifacts.provenance()})
         return inspected
@@ -109,18 +111,18 @@ def _pages(
         task: compare(
             tables.title if len(datasets) == 1 else f"{tables.title}: {task}",
             methods[task],
-            source_id=of_task.source,
-            goals=dict(of_task.relabeled),
-            details={**details, "collected": of_task.collect_result},
+            source_id=task_datasets.source,
+            goals=dict(task_datasets.relabeled),
+            details={**details, "collected": task_datasets.collect_result},
             film=film,
             **shared,
         )
-        for task, of_task in datasets.items()
+        for task, task_datasets in datasets.items()
     }
     if len(pages) == 1:
         return pages, next(iter(pages.values()))
     files = {task: f"{task}.html" for task in pages}
-    sources = [of_task.source for of_task in datasets.values()]
+    sources = [task_datasets.source for task_datasets in datasets.values()]
     return pages, overview(tables.title, methods, pages, files, sources=sources, details=details, **shared)
 
 

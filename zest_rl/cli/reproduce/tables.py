@@ -19,11 +19,11 @@ def as_text(result: Mapping[str, Any]) -> str:
             f"{row['n_seeds']:>7}{row['n_episodes']:>10}{paper:>8}"
         )
     if len(result["tasks"]) > 1:
-        for task, of_task in result["tasks"].items():
-            figures = (f"{name} {row['normalized_return']:.1f}" for name, row in of_task["rows"].items())
+        for task, task_result in result["tasks"].items():
+            figures = (f"{name} {row['normalized_return']:.1f}" for name, row in task_result["rows"].items())
             lines.append(f"{task}: {', '.join(figures)}")
-    for task, of_task in result["tasks"].items():
-        for name, rho in of_task["spearman_of_zest_and_true_returns"].items():
+    for task, task_result in result["tasks"].items():
+        for name, rho in task_result["spearman_of_zest_and_true_returns"].items():
             value = "undefined" if rho is None else f"{rho['value']:.3f}"
             lines.append(f"{task}, goal {name}: Spearman ρ of ZeST and true returns {value}")
     return "\n".join(
@@ -40,9 +40,9 @@ def as_markdown(result: Mapping[str, Any]) -> str:
     ]
     for name, row in result["rows"].items():
         low, high = row["ci95"]
-        of_tasks = (f"{result['tasks'][task]['rows'][name]['normalized_return']:.1f} | " for task in tasks)
+        by_task = (f"{result['tasks'][task]['rows'][name]['normalized_return']:.1f} | " for task in tasks)
         paper = "–" if row["paper"] is None else f"{row['paper']:.2f}"
         lines.append(
-            f"| {name} | {row['normalized_return']:.2f} | {low:.1f} to {high:.1f} | {''.join(of_tasks)}{paper} |"
+            f"| {name} | {row['normalized_return']:.2f} | {low:.1f} to {high:.1f} | {''.join(by_task)}{paper} |"
         )
     return "\n".join(lines) + "\n"
