@@ -202,13 +202,13 @@ def git_revision() -> str | None:
 
 def versions() -> dict[str, str]:
     """Return the versions of this package and of those of `PACKAGES` that are installed."""
-    found = {}
+    installed = {}
     for name in ("zest-rl", *PACKAGES):
         try:
-            found[name] = importlib.metadata.version(name)
+            installed[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
-    return found
+    return installed
 
 
 def provenance() -> dict[str, Any]:

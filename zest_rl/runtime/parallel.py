@@ -210,8 +210,6 @@ def read_parts(folder: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
         ZestError: a part is missing or damaged.
     """
     parts = {name: read_arrays(folder / f"{name}.npz") for name in names}
-    found = [part for part in parts.values() if part is not None]
-    if len(found) < len(parts):
-        gone = [name for name, part in parts.items() if part is None]
-        raise ZestError(f"parts of {folder} are missing or damaged ({', '.join(gone)}); run the command again")
-    return concatenate(found)
+    if missing := [name for name, part in parts.items() if part is None]:
+        raise ZestError(f"parts of {folder} are missing or damaged ({', '.join(missing)}); run the command again")
+    return concatenate([part for part in parts.values() if part is not None])

@@ -72,14 +72,15 @@ def run_jobs(
     from ray.util import ActorPool
 
     with _cluster(n_workers):
-        there = ray.cluster_resources()  # type: ignore[no-untyped-call]
-        n_gpus = 0 if device == "cpu" else int(there.get("GPU", 0))
+        resources = ray.cluster_resources()  # type: ignore[no-untyped-call]
+        n_gpus = 0 if device == "cpu" else int(resources.get("GPU", 0))
         if device == "cuda" and n_gpus == 0:
             raise BadInput("device 'cuda' is not there: the Ray cluster has no GPU; use cpu or auto")
-        most = n_gpus or int(there.get("CPU", 1))
+        n_places = n_gpus or int(resources.get("CPU", 1))
+        n_actors = min(n_workers or n_places, n_places, len(jobs))
         as_actor = ray.remote(num_cpus=1, num_gpus=min(n_gpus, 1), max_restarts=-1, max_task_retries=MAX_RETRIES)
         actor_class: Any = as_actor(_Worker)
-        actors = [actor_class.remote(work, str(Path.cwd())) for _ in range(min(n_workers or most, most, len(jobs)))]
+        actors = [actor_class.remote(work, str(Path.cwd())) for _ in range(n_actors)]
         pool: Any = ActorPool(actors)
         try:
             for _ in actors:  # jobs go only to those that have started: a busy cluster may have no place for the others
