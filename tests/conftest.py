@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from hypothesis import settings
+from tiny_dataset import COLLECTED, SHORT_HORIZON
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run in as many processes as there are cores
 settings.register_profile("zest", deadline=None, derandomize=True)  # a busy machine is no failure
@@ -31,9 +32,6 @@ def visual_tasks() -> Path:
     if not folder.is_dir():
         pytest.skip("no Visual Tasks Dataset: set ZEST_VISUAL_TASKS to its folder")
     return folder
-
-
-COLLECTED = "zest/kitchen-micro-tiny-v0"
 
 
 def collect_some(dataset_id: str, task: str, n_episodes: int) -> None:
@@ -74,9 +72,6 @@ def collected(collected_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
     return COLLECTED
-
-
-SHORT_HORIZON = 25
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from conftest import SHORT_HORIZON
+from tiny_dataset import SHORT_HORIZON
 
 from zest_rl.errors import ZestError
 from zest_rl.evaluation.evaluate import EPISODES_PER_JOB, EvaluationConfig, evaluate, evaluation_folder

@@ -17,7 +17,7 @@ import onnx
 import pytest
 import safetensors.torch
 import torch
-from conftest import COLLECTED, SHORT_HORIZON
+from tiny_dataset import COLLECTED, SHORT_HORIZON
 from torch import Tensor, nn
 
 from zest_rl.agents import get_agent, load_policy

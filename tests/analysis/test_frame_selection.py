@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from read_dataset import read
+from tiny_dataset import COLLECTED
 
-from tests.conftest import COLLECTED
 from zest_rl.analysis.frame_selection import Candidates, draw_candidates, score_as_actions, score_as_goals
 from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput

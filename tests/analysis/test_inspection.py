@@ -9,8 +9,8 @@ import h5py
 import numpy as np
 import pytest
 from read_dataset import read
+from tiny_dataset import COLLECTED
 
-from tests.conftest import COLLECTED
 from zest_rl.analysis.cross_task import inspect_datasets
 from zest_rl.analysis.inspection import Inspection, inspect, labels
 from zest_rl.analysis.reward_figures import FIGURES, warnings

@@ -9,9 +9,9 @@ from typing import Any
 
 import h5py
 import pytest
-from conftest import COLLECTED
 from PIL import Image
 from read_dataset import read
+from tiny_dataset import COLLECTED
 
 from zest_rl.cli import collect as collect_verb
 from zest_rl.cli import follow, select, train

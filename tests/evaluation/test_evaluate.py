@@ -15,8 +15,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from conftest import COLLECTED, SHORT_HORIZON
 from read_dataset import read
+from tiny_dataset import COLLECTED, SHORT_HORIZON
 
 from zest_rl.agents import load_policy
 from zest_rl.data.reader import Dataset

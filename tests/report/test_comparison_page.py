@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import COLLECTED
 from read_dataset import read
+from tiny_dataset import COLLECTED
 
 from zest_rl.data import reader
 from zest_rl.data.reader import Dataset
