@@ -3,6 +3,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -77,7 +78,7 @@ def cluster() -> Iterator[None]:
             include_dashboard=False,
             log_to_driver=False,
             logging_level="error",
-            runtime_env={"env_vars": {"PYTHONPATH": str(Path(__file__).parent)}},  # the work is defined here
+            runtime_env={"env_vars": {"PYTHONPATH": os.pathsep.join(sys.path)}},  # the work is defined here
         )
         yield
         assert ray.is_initialized(), "a cluster that was there is not ended"
