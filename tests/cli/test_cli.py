@@ -18,7 +18,8 @@ import tyro
 
 from zest_rl import __version__, cli
 from zest_rl.cli.config import load_config, parse_config, read_recipe
-from zest_rl.cli.ui import SilentUi, StreamUi, Ui
+from zest_rl.cli.terminal import StreamUi
+from zest_rl.cli.ui import SilentUi, Ui
 from zest_rl.errors import BadInput, ZestError
 
 

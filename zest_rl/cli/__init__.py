@@ -20,46 +20,11 @@ from types import ModuleType
 from typing import Any
 
 from zest_rl import __version__
-from zest_rl.cli.config import COMMON_FLAGS, parse_config
+from zest_rl.cli.config import parse_config
 from zest_rl.cli.output import print_failure, print_result
-from zest_rl.cli.ui import StreamUi
+from zest_rl.cli.terminal import StreamUi
+from zest_rl.cli.verbs import HELP, VERBS, sub_verb_help
 from zest_rl.errors import BadInput, nearest
-
-VERBS = {
-    "doctor": "check versions, rendering, weights and disk; say how to fix each",
-    "collect": "an expert with noise → a Minari dataset",
-    "relabel": "a dataset and a goal (pictures or sentences) → a dataset with ZeST rewards",
-    "inspect": "a relabeled dataset → what its rewards are worth, before anything is trained on them",
-    "select": "datasets and a goal → does the goal find its frames (`goals`), `actions`, real `footage`?",
-    "follow": "an episode that reaches several goals → its similarity to each of them over time",
-    "export": "a dataset → a file that other offline-RL code reads",
-    "train": "a dataset → a policy, by `bc` or `dt`",
-    "adopt": "a policy that another program trained → a run folder, as `train` leaves one",
-    "evaluate": "a policy → returns and success in MuJoCo, with videos",
-    "reproduce": "a recipe → a whole table or figure, cell by cell; rerun it to resume",
-    "report": "results → one HTML file",
-}
-
-HELP = """usage: zest VERB [arguments]
-
-A picture or a sentence as the reward function for offline robot learning:
-goal spec + frames → embeddings → scores → relabeled dataset → trainer → policy → evaluation → report
-
-verbs (`zest VERB --help` lists the arguments of one):
-{verbs}
-
-{common}
-
-also: --help, --version
-
-exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted (run the same command again to go on)
-
-examples:
-  zest doctor
-  zest collect --task micro
-  zest reproduce eval/demo.toml""".format(
-    verbs="\n".join(f"  {verb:<10} {summary}" for verb, summary in VERBS.items()), common=COMMON_FLAGS
-)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -98,7 +63,7 @@ def _run_verb(module: ModuleType, verb: str, words: list[str]) -> int:
     if config_class is None:
         configs: Mapping[str, type[Any]] = module.CONFIGS
         if words[:1] in (["-h"], ["--help"]):
-            print(_sub_verb_help(verb, configs))
+            print(sub_verb_help(verb, configs))
             return 0
         if not words or words[0] not in configs:
             got = repr(words[0]) if words else "nothing"
@@ -112,8 +77,3 @@ def _run_verb(module: ModuleType, verb: str, words: list[str]) -> int:
     if result:
         print_result(result, getattr(module, "summary", None), as_json=as_json)
     return 0 if result.get("ok", True) else 1
-
-
-def _sub_verb_help(verb: str, configs: Mapping[str, type[Any]]) -> str:
-    lines = [f"  {name:<10} {(config.__doc__ or '').splitlines()[0]}" for name, config in configs.items()]
-    return "\n".join([f"usage: zest {verb} SUB-VERB [arguments]", "", *lines, "", f"`zest {verb} SUB-VERB --help`"])

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from zest_rl.cli.select import clips, frames
-from zest_rl.cli.select.clips import ClipArguments
-from zest_rl.cli.select.frames import ActionArguments, GoalArguments
+from zest_rl.cli.select.clip_arguments import ClipArguments
+from zest_rl.cli.select.frame_arguments import ActionArguments, GoalArguments
 from zest_rl.cli.ui import Ui
 
 CONFIGS: dict[str, type[Any]] = {config.what: config for config in (GoalArguments, ActionArguments, ClipArguments)}
