@@ -93,7 +93,7 @@ def test_the_share_told_by_the_step_equals_a_loop_over_the_other_episodes(seed: 
             if at_step:
                 error += (value - np.mean(at_step)) ** 2
                 distance += (value - overall) ** 2
-    assert reward_quality.share_told_by_step(scores).value == pytest.approx(max(0, 1 - error / distance), abs=1e-5)
+    assert reward_quality.share_explained_by_step(scores).value == pytest.approx(max(0, 1 - error / distance), abs=1e-5)
 
 
 @pytest.mark.usefixtures("quick")
@@ -128,8 +128,8 @@ def test_a_perfect_reward_reaches_the_best_values() -> None:
 
 
 def test_a_clock_is_told_by_the_step_and_noise_is_not() -> None:
-    assert reward_quality.share_told_by_step([RISING] * N).value == 1
-    assert reward_quality.share_told_by_step(noise(0, n=200)).value < 0.05
+    assert reward_quality.share_explained_by_step([RISING] * N).value == 1
+    assert reward_quality.share_explained_by_step(noise(0, n=200)).value < 0.05
     assert reward_quality.value_order([RISING] * N).value == 1
     assert reward_quality.value_order([-RISING] * N).value == -1
     assert reward_quality.value_order([np.zeros(T, np.float32)] * N).value == 0
@@ -142,22 +142,22 @@ def test_saturation_counts_both_ends() -> None:
 
 def test_frames_equal_to_the_first_show_nothing() -> None:
     still = np.array([True, True, False, True])
-    assert reward_quality.share_still([still, still[:2]]).value == pytest.approx((3 / 4 + 1) / 2)
+    assert reward_quality.share_unchanged([still, still[:2]]).value == pytest.approx((3 / 4 + 1) / 2)
 
 
 def test_a_score_proportional_to_time_is_straight_whatever_its_slope_start_and_length() -> None:
     lines = [slope * np.arange(n) + start for slope, n, start in ((0.1, 10, 0.0), (1.0, 30, 5.0), (-0.3, 7, 1.0))]
-    assert reward_quality.straight_in_time([line.astype(np.float32) for line in lines]).value == pytest.approx(1)
+    assert reward_quality.linear_trend_r2([line.astype(np.float32) for line in lines]).value == pytest.approx(1)
     step = (np.arange(30) >= 15).astype(np.float32)
-    assert reward_quality.straight_in_time([step]).value == pytest.approx(np.corrcoef(step, np.arange(30))[0, 1] ** 2)
-    assert reward_quality.straight_in_time([np.ones(5, np.float32), np.ones(1, np.float32)]).value == 0
+    assert reward_quality.linear_trend_r2([step]).value == pytest.approx(np.corrcoef(step, np.arange(30))[0, 1] ** 2)
+    assert reward_quality.linear_trend_r2([np.ones(5, np.float32), np.ones(1, np.float32)]).value == 0
 
 
 def test_an_undefined_figure_is_nan_and_not_a_number_that_looks_good() -> None:
     constant = [np.ones(T, np.float32)] * N
     truth = noise(0)
     for estimate in (
-        reward_quality.share_told_by_step(constant),
+        reward_quality.share_explained_by_step(constant),
         reward_quality.share_saturated(constant),
         reward_quality.epic_distance(constant, truth),
         reward_quality.kendall(reward_quality.returns_of(constant), reward_quality.returns_of(truth)),
@@ -176,11 +176,11 @@ def test_every_interval_holds_its_value() -> None:
         states = [np.round(score)[:, None] for score in scores]
         for estimate in (
             reward_quality.value_order(mixed),
-            reward_quality.share_told_by_step(mixed),
-            reward_quality.share_told_by_step([score + 0.1 * RISING for score in mixed]),
+            reward_quality.share_explained_by_step(mixed),
+            reward_quality.share_explained_by_step([score + 0.1 * RISING for score in mixed]),
             reward_quality.share_saturated(mixed),
-            reward_quality.share_still([episode > 0 for episode in mixed]),
-            reward_quality.straight_in_time(mixed),
+            reward_quality.share_unchanged([episode > 0 for episode in mixed]),
+            reward_quality.linear_trend_r2(mixed),
             reward_quality.share_contradictory(mixed, states),
             reward_quality.kendall(returns, true_returns),
             reward_quality.pairwise_accuracy(returns, true_returns),

@@ -81,7 +81,7 @@ def candidates(
         seed: of that draw.
     """
     pool = [i for i, clip in enumerate(clips) if i != left_out and (diverse or clip.thing == thing)]
-    contexts = np.arange(len(pool)) if same_context else selection.others(len(pool), seed)
+    contexts = np.arange(len(pool)) if same_context else selection.draw_others(len(pool), seed)
     lengths = [len(embeddings[i]) for i in pool]
     reached = [
         (np.arange(n) >= n - max(1, round(GOAL_SHARE * n))) & (any_thing or clips[i].thing == thing)

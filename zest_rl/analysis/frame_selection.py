@@ -66,7 +66,7 @@ class Candidates:
             raise BadInput(f"unknown context {context!r}; {nearest(context, ('same', 'different'))}")
         if len(self.starts) < 2:
             raise BadInput("a different trajectory to take x_0 from needs at least 2 trajectories, got 1")
-        return np.asarray(self.starts[selection.others(len(self.starts), seed)[self.trajectory]])
+        return np.asarray(self.starts[selection.draw_others(len(self.starts), seed)[self.trajectory]])
 
 
 def draw_candidates(dataset_ids: Sequence[str], n_frames: int, seed: int = 0) -> Candidates:

@@ -89,12 +89,12 @@ def measure(
     """
     figures = {
         "value_order": reward_quality.value_order(rewards),
-        "told_by_step": reward_quality.share_told_by_step(rewards),
-        "straight_in_time": reward_quality.straight_in_time(scores),
+        "told_by_step": reward_quality.share_explained_by_step(rewards),
+        "straight_in_time": reward_quality.linear_trend_r2(scores),
         "saturated": reward_quality.share_saturated(rewards),
     }
     if still is not None:
-        figures["still"] = reward_quality.share_still(still)
+        figures["still"] = reward_quality.share_unchanged(still)
     if frames is not None:
         figures["contradictory"] = reward_quality.share_contradictory(scores, frames)
     if truth is not None:

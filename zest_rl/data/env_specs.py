@@ -1,7 +1,7 @@
-"""Whether the environment that a file names may be made: a Gymnasium EnvSpec (JSON) names code to run.
+"""Checks of a Gymnasium EnvSpec (JSON) that a file holds: building its environment runs the code that it names.
 
-A spec from elsewhere is made only if `check_env_spec` and `check_registered` both let it pass: its code is of a known
-package, and it is what that package registers under this id.
+It is built only if it passes both `check_env_spec` (its code belongs to a trusted package) and `check_registered` (that
+package registers the same code under this id).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ TRUSTED_ENTRY_POINTS = ("gymnasium.", "gymnasium_robotics.", "zest_rl.")
 
 
 def entry_points(env_spec: str, what: str) -> list[str]:
-    """Return the code that an EnvSpec (JSON) would run: of its environment, and of wrappers.
+    """Return the entry points that an EnvSpec (JSON) would run: the environment's, and those of its wrappers.
 
     Raises:
         BadInput: not an EnvSpec; `what` names it in the message.
@@ -31,7 +31,7 @@ def entry_points(env_spec: str, what: str) -> list[str]:
 
 
 def check_env_spec(env_spec: str, what: str, instead: str) -> None:
-    """Refuse an EnvSpec (JSON) that would run code of an unknown package: of its environment or a wrapper.
+    """Refuse an EnvSpec (JSON) whose environment or wrappers would run code of a package that is not trusted.
 
     Raises:
         BadInput: such an entry point, or not an EnvSpec; `what` names it in the message, `instead` ends it.
@@ -45,17 +45,17 @@ def check_env_spec(env_spec: str, what: str, instead: str) -> None:
 
 
 def check_registered(spec: EnvSpec) -> None:
-    """Refuse a spec from elsewhere whose entry point is not the registered one: it could call any function.
+    """Refuse a spec whose entry point is not the registered one: it could call any function.
 
     Raises:
         BadInput: such an entry point, or an id that is not registered here.
     """
     import gymnasium
 
-    known = gymnasium.registry.get(spec.id)
-    if known is None or spec.entry_point != known.entry_point:
+    registered = gymnasium.registry.get(spec.id)
+    if registered is None or spec.entry_point != registered.entry_point:
         raise BadInput(
             f"{spec.id} would run code of {spec.entry_point!r}, but "
-            + ("is not registered here" if known is None else f"is registered as {known.entry_point!r}")
+            + ("is not registered here" if registered is None else f"is registered as {registered.entry_point!r}")
             + "; install the version of its package that it was recorded with"
         )

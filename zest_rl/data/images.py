@@ -12,7 +12,7 @@ from zest_rl.errors import BadInput
 from zest_rl.types import Frame
 
 SUFFIXES = (".bmp", ".gif", ".jpeg", ".jpg", ".png", ".webp")
-"""Names that `list_images` takes for images, in any case. The content decides how a file is read, not its suffix."""
+"""File names that `list_images` counts as images, in any case; how a file is read depends on its content alone."""
 
 MAX_PIXELS = 16_000_000
 """Larger images are refused by their header: a file of a few kB can unpack to gigabytes."""

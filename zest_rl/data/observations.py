@@ -30,23 +30,23 @@ _JPEG = bytes((0xFF, 0xD8, 0xFF))
 
 
 def entries(node: h5py.Group | h5py.Dataset, prefix: str = "") -> dict[str, h5py.Dataset]:
-    """Return the datasets at or below a node by their paths, sorted; a node that is one itself goes by ""."""
+    """Return all datasets at or below a node by their paths, sorted; the path of the node itself is ""."""
     if isinstance(node, h5py.Dataset):
         return {prefix: node}
-    below: dict[str, h5py.Dataset] = {}
+    datasets: dict[str, h5py.Dataset] = {}
     for name in sorted(node):
-        below |= entries(node[name], f"{prefix}/{name}" if prefix else name)
-    return below
+        datasets |= entries(node[name], f"{prefix}/{name}" if prefix else name)
+    return datasets
 
 
 def n_channels(entry: h5py.Dataset) -> int | None:
     """Return 1 or 3 for pictures (3 for JPEG files), 0 for floats of that form but not in [0, 1], None for the rest."""
-    channels = _form(entry)
-    return channels if channels is None or entry.dtype.kind != "f" or _are_shares(entry) else 0
+    channels = _channels_by_form(entry)
+    return channels if channels is None or entry.dtype.kind != "f" or _is_in_unit_range(entry) else 0
 
 
 def is_numbers(entry: h5py.Dataset) -> bool:
-    """Whether an entry holds numbers for a policy: no pictures, no text, a row per step."""
+    """Whether an entry holds numbers that a policy can observe: no pictures, no text, one row per step."""
     return not n_channels(entry) and entry.dtype.kind in "biuf" and entry.ndim > 0
 
 
@@ -55,13 +55,13 @@ def acts_discretely(episode: h5py.Group) -> bool:
     return bool(episode["actions"].dtype.kind != "f")
 
 
-def _form(entry: h5py.Dataset) -> int | None:
+def _channels_by_form(entry: h5py.Dataset) -> int | None:
     if _is_jpeg(entry):
         return 3
     return None if entry.dtype.kind not in "uf" else _channels(entry.shape[1:])
 
 
-def _are_shares(entry: h5py.Dataset) -> bool:
+def _is_in_unit_range(entry: h5py.Dataset) -> bool:
     """Whether floats are in [0, 1], by their space, or by their values where that has no bounds."""
     bounds = _declared_bounds(entry)
     if np.isfinite(bounds).all():
@@ -72,7 +72,7 @@ def _are_shares(entry: h5py.Dataset) -> bool:
 
 
 def _declared_bounds(entry: h5py.Dataset) -> tuple[float, float]:
-    """Return the lowest and the highest value of an entry's space, which Minari keeps beside its file."""
+    """Return the bounds of an entry's space, which Minari keeps beside its file; infinite where there are none."""
     metadata = Path(entry.file.filename).with_name("metadata.json")
     _, _, part, *names = entry.name.split("/")
     try:
@@ -116,7 +116,7 @@ def read_pictures(entry: h5py.Dataset, rows: slice) -> list[Frame]:
     Raises:
         BadInput: the entry holds no pictures, or floats that are not in [0, 1].
     """
-    if _form(entry) is None:
+    if _channels_by_form(entry) is None:
         raise BadInput(
             f"{entry.name} holds no pictures (got shape {entry.shape[1:]} and dtype {entry.dtype} per step); they must "
             "be (H, W), (H, W, C) or (C, H, W) with 1 or 3 channels, uint8 or floats in [0, 1]"
@@ -148,22 +148,24 @@ def as_frame(picture: NDArray[Any], what: str) -> Frame:
 
 
 def choose_pictures(channels: dict[str, int | None], wanted: Iterable[str], where: str, prefix: str = "") -> list[str]:
-    """Choose the entries whose pictures are the frames: those that are asked for, or the only one.
+    """Choose the entries whose pictures are the frames: the ones asked for, or the only one.
 
     Args:
-        channels: entry → their number, None where it is no picture, 0 where it is one only if it is asked for.
-        wanted: their names, with or without `prefix`; empty: the only one in colour, else the only one.
+        channels: entry → its `n_channels`: None for no picture, 0 for a picture only if it is asked for.
+        wanted: names of entries, with or without `prefix`; empty: the only one in colour, else the only one.
         where: names the dataset in an error.
-        prefix: what stands before each name for the user, such as ``observations``.
+        prefix: put before each name in messages, such as ``observations``.
 
     Raises:
         BadInput: no such entry, none at all, or several; the message lists them.
     """
-    shown = {name: "/".join(part for part in (prefix, name) if part) for name, n in channels.items() if n is not None}
-    listing = ", ".join(shown.values()) or "(none)"
+    full_names = {
+        name: "/".join(part for part in (prefix, name) if part) for name, n in channels.items() if n is not None
+    }
+    listing = ", ".join(full_names.values()) or "(none)"
     chosen = []
     for key in wanted:
-        name = next((name for name, full in shown.items() if key in (name, full)), None)
+        name = next((name for name, full in full_names.items() if key in (name, full)), None)
         if name is None:
             raise BadInput(
                 f"{where} has no pictures at {key!r}, and there is no such folder; entries with pictures: {listing}"
@@ -171,10 +173,10 @@ def choose_pictures(channels: dict[str, int | None], wanted: Iterable[str], wher
         chosen.append(name)
     if chosen:
         return chosen
-    colour = [name for name in shown if channels[name] == 3]
-    pictures = colour or [name for name in shown if channels[name]]
+    colour = [name for name in full_names if channels[name] == 3]
+    pictures = colour or [name for name in full_names if channels[name]]
     if len(pictures) != 1:
-        several = ", ".join(shown[name] for name in pictures)
+        several = ", ".join(full_names[name] for name in pictures)
         problem = f"several entries with pictures: {several}" if pictures else "no entry with pictures"
         raise BadInput(
             f"{where} has {problem}; "
@@ -184,7 +186,7 @@ def choose_pictures(channels: dict[str, int | None], wanted: Iterable[str], wher
 
 
 def stored_rows(entry: h5py.Dataset) -> Iterator[NDArray[Any]]:
-    """Yield what an entry holds as it is stored, `ROWS` steps at a time; text as the bytes of each row."""
+    """Yield the raw values of an entry, `ROWS` steps at a time; text as the bytes of each row."""
     if h5py.check_vlen_dtype(entry.dtype) is not None:
         for row in range(len(entry)):
             value = entry[row]
@@ -196,8 +198,8 @@ def stored_rows(entry: h5py.Dataset) -> Iterator[NDArray[Any]]:
 def numbers(node: h5py.Group | h5py.Dataset) -> FloatArray:
     """Flatten the numbers of an observation: one row per step.
 
-    The entries of a Dict follow each other in the alphabetical order of their paths, as Gymnasium's ``flatten`` has
-    them; pictures and text are left out, and a Discrete stays one number.
+    The entries of a Dict are concatenated in the alphabetical order of their paths, as by Gymnasium's ``flatten``;
+    pictures and text are left out, and a Discrete stays one number.
 
     Returns:
         (T+1, n) float32.

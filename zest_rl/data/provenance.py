@@ -1,7 +1,7 @@
-"""How a dataset was made: typed records of what its metadata say under "zest", and a run's ``meta.json`` after them.
+"""How a dataset was made: typed records of the entry "zest" in its metadata, which a run's ``meta.json`` repeats.
 
 Up to three stages leave a record: ``collect`` (`CollectRecord`), ``recorded`` (steps per second of an imported dataset)
-and ``relabel`` (`RelabelRecord`). What earlier versions did not write has its default; what later ones add is ignored.
+and ``relabel`` (`RelabelRecord`). Fields that an earlier version did not write have defaults; unknown ones are ignored.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import Any, Literal, Self
 from zest_rl.errors import BadInput
 
 
-def _known(record: type[Any], values: Mapping[str, Any]) -> dict[str, Any]:
+def _field_values(record: type[Any], values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values that a record has fields for."""
-    return {each.name: values[each.name] for each in fields(record) if each.name in values}
+    return {field.name: values[field.name] for field in fields(record) if field.name in values}
 
 
 @dataclass(frozen=True)
@@ -24,14 +24,14 @@ class CollectRecord:
     """How a dataset was collected (`zest_rl.kitchen.collect`)."""
 
     asked: Mapping[str, Any] = field(default_factory=dict)
-    """The arguments, but for names and numbers of processes."""
+    """The arguments, without names and numbers of processes."""
     result: Mapping[str, Any] = field(default_factory=dict)
-    """What came of them: calibrated numbers, returns of the references, normalized return."""
+    """Calibrated numbers, returns of the references, normalized return."""
 
 
 @dataclass(frozen=True)
 class ScorerRecord:
-    """What scored: a goal, an embedder, and how they are compared."""
+    """The scorer: a goal, an embedder, and how they are compared."""
 
     goal: str
     """Goal spec, see `zest_rl.rewards.goals`."""
@@ -46,15 +46,15 @@ class ScorerRecord:
     views: Mapping[str, Any] | None = None
     """Fields of `zest_rl.kitchen.views.Views`, from which kitchen states were rendered; None for other frames."""
     views_sha256: str | None = None
-    """Of all that such a frame depends on besides the state."""
+    """Hash of everything that such a frame depends on besides the state."""
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
         """Read what `to_json` returned."""
-        return cls(**_known(cls, {**values, **values["config"]}))
+        return cls(**_field_values(cls, {**values, **values["config"]}))
 
     def to_json(self) -> dict[str, Any]:
-        """Config and content hashes, as datasets hold them."""
+        """Config and content hashes, as a dataset's metadata hold them."""
         names = ("goal", "embedder", "features", "similarity", "precision", "goal_share")
         hashes = {"goal_sha256": self.goal_sha256, "embedder_sha256": self.embedder_sha256}
         config = {name: getattr(self, name) for name in names}
@@ -65,23 +65,23 @@ class ScorerRecord:
 
 @dataclass(frozen=True)
 class RelabelRecord:
-    """How the rewards of a dataset were made of scores (`zest_rl.rewards.relabel`)."""
+    """How a dataset was relabeled (`zest_rl.rewards.relabel`)."""
 
     source: str
-    """Id of what was relabeled."""
+    """Id of the dataset that was relabeled."""
     source_sha256: str
-    """Its fingerprint: all that training may see of it, but no rewards."""
+    """Its fingerprint: everything that training may see, except the rewards."""
     reward: Literal["level", "difference"]
     """The score after each action, or its change."""
     scorer: ScorerRecord
     shuffle: int | None = None
-    """Seed of the null control, which gives every episode the scores of another one; None: its own."""
+    """Seed of the null control, in which each episode has the scores of another one; None: its own."""
     kept_goals: tuple[int, ...] | None = None
     """Indices of the goals that were used; None: all."""
     n_still_frames: int | None = None
-    """Frames without any change against their first frame."""
+    """Number of unchanged frames: equal to the first of their episode in every view."""
     frames: Mapping[str, Any] | None = None
-    """Where frames come from that are not rendered from kitchen states (`sources.base.EpisodeFrames.describe`)."""
+    """Origin of frames that were not rendered from kitchen states (`sources.base.EpisodeFrames.describe`)."""
     frames_sha256: str | None = None
     provenance: Mapping[str, Any] | None = None
     """Command, versions and machine; left out of a run's ``meta.json``."""
@@ -91,7 +91,9 @@ class RelabelRecord:
         """Read what `to_json` returned."""
         kept = values.get("kept_goals")
         scorer = ScorerRecord.from_json(values["scorer"])
-        return cls(**{**_known(cls, values), "scorer": scorer, "kept_goals": None if kept is None else tuple(kept)})
+        return cls(
+            **{**_field_values(cls, values), "scorer": scorer, "kept_goals": None if kept is None else tuple(kept)}
+        )
 
     @property
     def is_foreign(self) -> bool:
@@ -104,7 +106,7 @@ class RelabelRecord:
         return int(self.scorer.views["n_views"]) if self.scorer.views is not None else len((self.frames or {})["views"])
 
     def to_json(self) -> dict[str, Any]:
-        """What a dataset's metadata hold of it."""
+        """The record as a dataset's metadata hold it."""
         frames = {} if self.frames is None else {"frames": dict(self.frames), "frames_sha256": self.frames_sha256}
         provenance = {} if self.provenance is None else {"provenance": dict(self.provenance)}
         return {
@@ -135,14 +137,14 @@ class DatasetRecord:
     relabel: RelabelRecord | None
     """None: its rewards are no ZeST scores."""
     fps: float | None
-    """Steps per second of the recording that it was imported from, where that says so."""
+    """Steps per second of the recording that it was imported from, if known."""
 
     @classmethod
     def from_metadata(cls, dataset_id: str, metadata: Mapping[str, Any]) -> Self:
         """Read Minari's metadata of a dataset.
 
         Raises:
-            BadInput: a stage left another record than ours.
+            BadInput: the record of a stage is not in our format.
         """
         stages = metadata.get("zest") or {}
         collect, relabel = stages.get("collect"), stages.get("relabel")
@@ -175,11 +177,11 @@ class DatasetRecord:
 
     @property
     def task(self) -> str | None:
-        """Which kitchen task it is of, None when its environment is another one."""
+        """The kitchen task; None for another environment."""
         name = self.env.get("kwargs", {}).get("task")
         return None if name is None or not str(self.env.get("entry_point")).startswith("zest_rl.") else str(name)
 
     @property
     def is_foreign(self) -> bool:
-        """Whether it was relabeled by frames that were not rendered from kitchen states."""
+        """Whether it was relabeled with frames that were not rendered from kitchen states."""
         return self.relabel is not None and self.relabel.is_foreign

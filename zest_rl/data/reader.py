@@ -10,9 +10,9 @@ Layout of one dataset, alignment in `zest_rl.types`::
                                 infos/gt/{reward, success} (T+1,), infos/zest/score (T+1,) once relabeled}
 
 Datasets of other environments may hold observations in a group (`zest_rl.data.observations`), no state and no ground
-truth; once relabeled, what they came with is ``infos/source/{reward, success}`` (T+1,), 0 at the reset.
+truth; a relabeled copy keeps their own rewards as ``infos/source/{reward, success}`` (T+1,), 0 at the reset.
 
-`open_dataset` verifies the files once for all that is read. Ground truth is read by `Dataset.truth` alone;
+`open_dataset` verifies the files once for everything that is read. Ground truth is read by `Dataset.truth` alone;
 `Dataset.episodes` and `Dataset.states` never open it.
 """
 
@@ -43,7 +43,7 @@ from zest_rl.types import Episode, FloatArray, GroundTruth
 DATASET_ID = re.compile(r"(?:[A-Za-z0-9][\w.-]+/)*[A-Za-z0-9][\w.-]*-v\d+")
 DATA_FILE, METADATA_FILE, MANIFEST_FILE = "data/main_data.hdf5", "data/metadata.json", "zest_manifest.json"
 SOURCE_REWARD, SOURCE_SUCCESS = "infos/source/reward", "infos/source/success"
-"""Where the rewards and successes of another environment's dataset are kept (T+1,) when it is relabeled."""
+"""Original rewards and successes (T+1,) in a relabeled dataset of another environment."""
 _GT_REWARD = "infos/gt/reward"
 
 
@@ -80,13 +80,13 @@ def exists(dataset_id: str) -> bool:
 
 @dataclass(frozen=True)
 class Dataset:
-    """An open dataset, whose files were found as they were written. Made by `open_dataset`."""
+    """An open dataset whose files match their hashes; see `open_dataset`."""
 
     id: str
     path: Path
     """Its folder."""
     metadata: Mapping[str, Any]
-    """As they are on disk; `record` is what this package knows of them."""
+    """The whole of ``metadata.json``; `record` is the typed part of it."""
     groups: Mapping[str, h5py.Group]
     """Episodes by their names in the HDF5 file, ``episode_0`` first; gone once the dataset is closed."""
 
@@ -103,11 +103,11 @@ class Dataset:
     def episodes(self, *, discrete: bool = False) -> list[Episode]:
         """Read what a trainer may see of every episode; a Dict of observations is flattened (`observations.numbers`).
 
-        Actions of several dimensions are flattened; those of a Discrete space (T,) are read as (T, 1) where `discrete`.
+        Actions of several dimensions are flattened; those of a Discrete space, (T,), are read as (T, 1) if `discrete`.
 
         Raises:
-            BadInput: an episode without steps, lengths that do not fit, NaN, no observations but pictures, discrete
-                actions that were not asked for.
+            BadInput: an episode without steps, lengths that do not fit, NaN, observations that are pictures alone,
+                discrete actions without `discrete`.
             ZestError: the file is damaged.
         """
 
@@ -192,13 +192,13 @@ class Dataset:
         return self._arrays("infos/zest/score")
 
     def source_rewards(self) -> list[FloatArray] | None:
-        """Read the rewards (T,) that a dataset of another environment had before it was relabeled; None: no such."""
+        """Read the rewards (T,) that a dataset of another environment had before it was relabeled; None without any."""
         if not all(SOURCE_REWARD in group for group in self.groups.values()):
             return None
         return [rewards[1:] for rewards in self._arrays(SOURCE_REWARD)]
 
     def rewards_to_keep(self) -> list[FloatArray | None]:
-        """Read the rewards (T,) of every episode that a copy keeps as its source's; None: none, or ground truth."""
+        """Read the original rewards (T,) that a relabeled copy keeps; None for ground truth, or if there are none."""
 
         def read(group: h5py.Group) -> FloatArray | None:
             if _GT_REWARD in group:
@@ -210,7 +210,7 @@ class Dataset:
         return self._each(read)
 
     def fingerprint(self) -> str:
-        """Hash what relabeling and training may see: observations, actions, ends and states; no rewards."""
+        """Hash everything that relabeling and training may see, except rewards: observations, actions, ends, states."""
 
         def digest(group: h5py.Group) -> str:
             if "observations" not in group:
@@ -220,15 +220,15 @@ class Dataset:
             arrays = [actions, np.array([bool(len(ends) and ends[-1])])]
             if "infos/state/qpos" in group:
                 arrays.append(self._array(group, "infos/state/qpos", np.float64))
-            return artifacts.hash_stream(itertools.chain(_observed(group["observations"]), arrays))
+            return artifacts.hash_stream(itertools.chain(_observation_parts(group["observations"]), arrays))
 
         return artifacts.hash_json(self._each(digest))
 
     def describe(self) -> dict[str, Any]:
-        """What a trained policy must remember of its dataset, JSON-ready: identity, environment, scale, provenance.
+        """Identity, environment, scale and provenance, JSON-ready, for the ``meta.json`` of a policy trained on it.
 
-        Command, versions and machine stay in the dataset's metadata: an equal dataset made again has an equal
-        description. `DatasetRecord.from_description` reads it.
+        Command, versions and machine are left out, so that an equal dataset made again has an equal description.
+        `DatasetRecord.from_description` reads it.
 
         Raises:
             BadInput: a policy could not be evaluated on the dataset, or as in `episodes`.
@@ -253,7 +253,7 @@ class Dataset:
         }
 
     def kitchen_task(self) -> str:
-        """Return which kitchen task the dataset is of.
+        """Return the kitchen task of the dataset.
 
         Raises:
             BadInput: its environment is not the kitchen.
@@ -330,14 +330,14 @@ def _verified_metadata(dataset_id: str) -> dict[str, Any]:
 
 @contextmanager
 def open_dataset(dataset_id: str) -> Iterator[Dataset]:
-    """Open a dataset after comparing its files with their hashes, once for all that is read of it.
+    """Open a dataset after comparing its files with their hashes.
 
-    Whoever builds an environment from its env_spec checks it by `zest_rl.data.env_specs` first; reading runs no code.
+    Reading runs no code; before an environment is built from the env_spec, `zest_rl.data.env_specs` must check it.
 
     Raises:
-        BadInput: no such dataset (the nearest are named), an env_spec in it is none, another storage than HDF5, or
-            episodes are missing.
-        ZestError: a file was damaged or changed since it was written.
+        BadInput: no such dataset (the nearest ids are named), an invalid env_spec, a storage other than HDF5, or
+            missing episodes.
+        ZestError: a file is damaged or was changed since it was written.
     """
     metadata, path = _verified_metadata(dataset_id), dataset_path(dataset_id)
     try:
@@ -356,8 +356,8 @@ def open_dataset(dataset_id: str) -> Iterator[Dataset]:
         yield Dataset(dataset_id, path, metadata, {name: file[name] for name in names})
 
 
-def _observed(node: h5py.Group | h5py.Dataset) -> Iterator[NDArray[Any]]:
-    """Yield an episode's observations in parts: pictures as they are stored, a few at a time, numbers as float32."""
+def _observation_parts(node: h5py.Group | h5py.Dataset) -> Iterator[NDArray[Any]]:
+    """Yield an episode's observations in parts: raw pictures, a few steps at a time, and numbers as float32."""
     for entry in entries(node).values():
         if is_numbers(entry):
             yield np.asarray(entry[()], dtype=np.float32)

@@ -19,7 +19,7 @@ VIDEO_SUFFIXES = (".avi", ".mkv", ".mov", ".mp4", ".webm")
 
 
 def iter_frames(path: Path) -> Iterator[Frame]:
-    """Yield all frames of a video, each as it is stored: (H, W, 3) uint8 RGB.
+    """Yield all stored frames of a video: (H, W, 3) uint8 RGB.
 
     Args:
         path: a video file that ffmpeg reads, or a folder of pictures, in the order of `frame_files`.
@@ -42,17 +42,17 @@ def iter_frames(path: Path) -> Iterator[Frame]:
 
 
 def read_frames(path: Path, n_frames: int) -> list[Frame]:
-    """Read frames that are evenly spaced over a video, the first and the last among them.
+    """Read evenly spaced frames of a video, including the first and the last.
 
     Args:
         path: see `iter_frames`.
-        n_frames: how many; a shorter video gives all it has.
+        n_frames: how many; all of a shorter video.
 
     Returns:
         (H, W, 3) uint8 RGB each.
 
     Raises:
-        BadInput: nothing there, no video, or fewer than 2 frames.
+        BadInput: missing, no video, or fewer than 2 frames.
     """
     if n_frames < 2:
         raise BadInput(f"a clip needs at least 2 frames, its first and its last, got {n_frames}")
@@ -84,5 +84,5 @@ def frame_files(folder: Path) -> list[Path]:
 
 
 def evenly_spaced(n: int, n_wanted: int) -> NDArray[np.intp]:
-    """Return the indices of up to `n_wanted` of n frames, evenly spaced, the first and the last among them."""
+    """Return the indices of up to `n_wanted` of n frames, evenly spaced, including the first and the last."""
     return np.unique(np.linspace(0, n - 1, min(n, n_wanted)).round().astype(np.intp)) if n else np.zeros(0, np.intp)

@@ -1,4 +1,4 @@
-"""Episodes → Minari datasets: staged, verified, locked and renamed once; nothing is ever half written.
+"""Episodes → Minari datasets: locked, staged, verified, then renamed; nothing is ever half written.
 
 The layout on disk is drawn in `zest_rl.data.reader`, the alignment of the arrays in `zest_rl.types`.
 """
@@ -11,6 +11,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -36,7 +37,7 @@ from zest_rl.types import Episode, FloatArray
 
 @dataclass(frozen=True)
 class Recording:
-    """One collected episode, everything that is stored of it (T steps)."""
+    """One collected episode of T steps, as it is stored."""
 
     seed: int
     obs: FloatArray
@@ -54,14 +55,14 @@ class Recording:
     """(T+1,) bool."""
 
     def __post_init__(self) -> None:
-        Episode(self.obs, self.actions, self.gt_reward[1:], self.terminated)  # it checks shapes, types, finiteness
+        Episode(self.obs, self.actions, self.gt_reward[1:], self.terminated)  # checks shapes, types, finiteness
         wrong = [name for name in ("qpos", "qvel", "gt_success") if len(getattr(self, name)) != len(self.obs)]
         if wrong:
             raise BadInput(f"{' and '.join(wrong)} must have T + 1 = {len(self.obs)} rows, as many as obs")
 
 
 def _in_child(build: Callable[..., None], *args: object) -> None:
-    """Run an HDF5 write in a process of its own: on a full disk the library kills its process."""
+    """Run an HDF5 write in a child process: on a full disk the library kills its process."""
     context = multiprocessing.get_context("spawn")
     receive, send = context.Pipe(duplex=False)
     child = context.Process(target=_report_errors, args=(send, build, *args))
@@ -78,7 +79,7 @@ def _in_child(build: Callable[..., None], *args: object) -> None:
 
 
 def _report_errors(send: Any, build: Callable[..., None], *args: object) -> None:
-    die_with_parent()  # else it would go on writing where the next try writes
+    die_with_parent()  # else it would go on writing to the files of the next attempt
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # on a full disk HDF5 prints hundreds of tracebacks
     try:
         build(*args)
@@ -90,33 +91,31 @@ def _report_errors(send: Any, build: Callable[..., None], *args: object) -> None
 
 
 def _set_metadata(path: Path, **values: object) -> None:
-    metadata = artifacts.read_json(path)
-    metadata.update(values)
-    artifacts.write_json(path, metadata)
+    artifacts.write_json(path, {**artifacts.read_json(path), **values})
 
 
-def _publish(staging: Path, dataset_id: str, meant: Iterable[Mapping[str, NDArray[Any]]]) -> None:
-    """Compare a staged dataset with the arrays that were meant to be written, and write its manifest.
+def _seal(staging: Path, dataset_id: str, expected: Iterable[Mapping[str, NDArray[Any]]]) -> None:
+    """Compare a staged dataset with the arrays that it must hold, and write its manifest.
 
-    h5py drops the error of a write that fails while an array is closed, so only reading shows that all is there.
+    h5py drops the error of a write that fails while an array is closed, so only reading proves that it is complete.
     """
-    n_meant = 0
+    n_expected = 0
     with h5py.File(staging / DATA_FILE, "r") as file:
-        for i, arrays in enumerate(meant):
-            n_meant += 1
+        for i, arrays in enumerate(expected):
+            n_expected += 1
             for name, array in arrays.items():
                 stored = file.get(f"episode_{i}/{name}")
                 if stored is None or not np.array_equal(stored[()], array, equal_nan=True):
                     raise ZestError(f"{name} of episode {i} of {dataset_id} was not written whole; is the disk full?")
-        if len(file) != n_meant:
-            raise ZestError(f"{len(file)} of {n_meant} episodes of {dataset_id} were written; try again")
+        if len(file) != n_expected:
+            raise ZestError(f"{len(file)} of {n_expected} episodes of {dataset_id} were written; try again")
     files = [path for path in sorted(staging.rglob("*")) if path.is_file()]
     digests = {path.relative_to(staging).as_posix(): artifacts.hash_file(path) for path in files}
     artifacts.write_json(staging / MANIFEST_FILE, digests)
 
 
-def _stored(recording: Recording) -> dict[str, NDArray[Any]]:
-    """Return the arrays of one episode under the names that they have on disk."""
+def _arrays_on_disk(recording: Recording) -> dict[str, NDArray[Any]]:
+    """Return the arrays of one episode by their names on disk."""
     ends = np.zeros(len(recording.actions), dtype=bool)
     ends[-1] = True
     return {
@@ -132,16 +131,18 @@ def _stored(recording: Recording) -> dict[str, NDArray[Any]]:
     }
 
 
-def _build_new(root: Path, dataset_id: str, recordings: Sequence[Recording], fields: Mapping[str, Any]) -> None:
+def _build_new(
+    root: Path, dataset_id: str, recordings: Sequence[Recording], env_spec: str, fields: Mapping[str, Any]
+) -> None:
     os.environ["MINARI_DATASETS_PATH"] = str(root)  # of this child process only
     import gymnasium
     import minari
     from minari.data_collector import EpisodeBuffer
 
-    spec = gymnasium.envs.registration.EnvSpec.from_json(fields["env_spec"])
+    spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
     buffers = []
     for i, recording in enumerate(recordings):
-        arrays = _stored(recording)
+        arrays = _arrays_on_disk(recording)
         infos = {
             "state": {key: arrays.pop(f"infos/state/{key}") for key in ("qpos", "qvel")},
             "gt": {key: arrays.pop(f"infos/gt/{key}") for key in ("reward", "success")},
@@ -149,16 +150,19 @@ def _build_new(root: Path, dataset_id: str, recordings: Sequence[Recording], fie
         buffers.append(EpisodeBuffer(id=i, seed=recording.seed, infos=infos, **arrays))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Minari warns of every optional field that is not given
-        minari.create_dataset_from_buffers(
-            dataset_id,
-            buffers,
-            env=spec,
-            eval_env=spec,
-            ref_min_score=fields["ref_min_score"],
-            ref_max_score=fields["ref_max_score"],
-            algorithm_name=fields["algorithm_name"],
-            description=fields["description"],
-        )
+        minari.create_dataset_from_buffers(dataset_id, buffers, env=spec, eval_env=spec, **fields)
+
+
+@contextmanager
+def _staged(dataset_id: str, n_bytes: int) -> Iterator[Path]:
+    """Lock the folder of a new dataset, and yield one that is renamed to it at the end; raises as `write_dataset`."""
+    final = dataset_path(dataset_id)
+    with artifacts.lock(final):
+        if exists(dataset_id):
+            raise BadInput(f"dataset {dataset_id} exists already; choose another name or delete {final}")
+        artifacts.check_free_space(final.parent, n_bytes)
+        with artifacts.staged_folder(final) as staging:
+            yield staging
 
 
 def write_dataset(
@@ -180,7 +184,7 @@ def write_dataset(
         env_spec: Gymnasium EnvSpec as JSON.
         ref_min_score: ground-truth return of the robot doing nothing (0 on the normalized scale).
         ref_max_score: mean ground-truth return of the expert (100 on the normalized scale).
-        algorithm_name: what acted.
+        algorithm_name: the policy that acted.
         description: one paragraph for readers.
         zest: how the dataset was made; kept in the metadata.
 
@@ -191,32 +195,26 @@ def write_dataset(
         BadInput: bad id, no episodes, or a dataset of this id exists.
         ZestError: the disk is full or read-only; nothing is left behind.
     """
-    final = dataset_path(dataset_id)
     if not recordings:
         raise BadInput("a dataset must have at least 1 episode, got 0; collect some first")
     fields = {
-        "env_spec": env_spec,
         "ref_min_score": ref_min_score,
         "ref_max_score": ref_max_score,
         "algorithm_name": algorithm_name,
         "description": description,
     }
-    with artifacts.lock(final):
-        if exists(dataset_id):
-            raise BadInput(f"dataset {dataset_id} exists already; choose another name or delete {final}")
-        n_bytes = sum(r.obs.nbytes + r.actions.nbytes + r.qpos.nbytes + r.qvel.nbytes for r in recordings)
-        artifacts.check_free_space(final.parent, 2 * n_bytes)
-        with artifacts.staged_folder(final) as staging:
-            _in_child(_build_new, staging / "root", dataset_id, recordings, fields)
-            (staging / "root" / dataset_id / "data").rename(staging / "data")
-            shutil.rmtree(staging / "root")
-            _set_metadata(staging / METADATA_FILE, zest=dict(zest))
-            _publish(staging, dataset_id, [_stored(recording) for recording in recordings])
-    return final
+    n_bytes = sum(r.obs.nbytes + r.actions.nbytes + r.qpos.nbytes + r.qvel.nbytes for r in recordings)
+    with _staged(dataset_id, 2 * n_bytes) as staging:
+        _in_child(_build_new, staging / "root", dataset_id, recordings, env_spec, fields)
+        (staging / "root" / dataset_id / "data").rename(staging / "data")
+        shutil.rmtree(staging / "root")
+        _set_metadata(staging / METADATA_FILE, zest=dict(zest))
+        _seal(staging, dataset_id, map(_arrays_on_disk, recordings))
+    return dataset_path(dataset_id)
 
 
 class Trajectories(Protocol):
-    """The episodes that get new rewards."""
+    """Episodes that can be written with new rewards."""
 
     @property
     def dataset_id(self) -> str:
@@ -228,27 +226,27 @@ class Trajectories(Protocol):
 
     @property
     def n_bytes(self) -> int:
-        """About what `fill` writes."""
+        """Approximate size of the files that `fill` writes."""
 
     def fingerprint(self) -> str:
-        """64 hex digits over all that training may see of them, but no rewards."""
+        """64 hex digits over everything that training may see, except the rewards."""
 
     def rewards_to_keep(self) -> Sequence[FloatArray | None]:
-        """Rewards (T,) of every episode to keep beside the new ones; None, or all NaN: there are none to keep."""
+        """Rewards (T,) of every episode to keep beside the new ones; None, or all NaN, if there are none."""
 
     def fill(self, folder: Path) -> None:
-        """Leave a Minari dataset's `DATA_FILE` and `METADATA_FILE` in `folder`, never all episodes in memory.
+        """Write a Minari dataset's `DATA_FILE` and `METADATA_FILE` to `folder`, without all episodes in memory.
 
-        Runs in a process of its own. Rewards that are not there to begin with are NaN.
+        Called in a child process. Missing rewards are written as NaN.
         """
 
     def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
-        """Yield for every episode the arrays that `fill` must have left, by their names on disk."""
+        """Yield for every episode the arrays that `fill` must have written, by their names on disk."""
 
 
 @dataclass(frozen=True)
 class DatasetCopy:
-    """The `Trajectories` of a Minari dataset, copied as they are; what is read of them was read by `of`."""
+    """The `Trajectories` of a Minari dataset, whose files are copied; made by `of` from an open dataset."""
 
     dataset_id: str
     path: Path
@@ -260,7 +258,7 @@ class DatasetCopy:
 
     @classmethod
     def of(cls, ds: Dataset) -> Self:
-        """Read what the new dataset needs to know of a dataset that is open."""
+        """Read the fields from an open dataset."""
         return cls(ds.id, ds.path, ds.n_steps(), ds.fingerprint(), ds.rewards_to_keep())
 
     @property
@@ -301,7 +299,7 @@ def _build_scored(trajectories: Trajectories, folder: Path, scored: Sequence[Map
 
 
 def _scored(reward: FloatArray, score: FloatArray, source: FloatArray | None) -> dict[str, FloatArray]:
-    """Return what is new in an episode, under the names on disk."""
+    """Return the new arrays of an episode by their names on disk."""
     arrays = {"rewards": reward, "infos/zest/score": score}
     if source is not None and not np.isnan(source).all():
         arrays[SOURCE_REWARD] = np.concatenate([np.zeros(1, np.float32), source])
@@ -318,9 +316,9 @@ def write_scored(
     zest: Mapping[str, Any],
     extra: Callable[[Path], None],
 ) -> Path:
-    """Write episodes with other rewards; everything else, ground truth included, stays bit for bit.
+    """Write episodes with new rewards; everything else, ground truth included, stays the same bit for bit.
 
-    Rewards that are not the kitchen's ground truth are kept as ``infos/source/reward``.
+    Original rewards that are not the kitchen's ground truth are kept as ``infos/source/reward``.
 
     Args:
         trajectories: the episodes.
@@ -329,7 +327,7 @@ def write_scored(
         scores: (T+1,) float32 per episode, kept as ``infos/zest/score``.
         description: appended to the source's description.
         zest: provenance, kept in the metadata beside the source's own.
-        extra: called with the staged folder, to leave further files in it.
+        extra: called with the staged folder, to write further files to it.
 
     Returns:
         The new dataset's folder.
@@ -338,26 +336,21 @@ def write_scored(
         BadInput: the new id exists; lengths do not fit; a value is not finite.
         ZestError: the disk is full or read-only; nothing is left behind.
     """
-    final, n_steps = dataset_path(dataset_id), list(trajectories.n_steps)
+    n_steps = list(trajectories.n_steps)
     if [len(r) for r in rewards] != n_steps or [len(s) for s in scores] != [n + 1 for n in n_steps]:
         raise BadInput("rewards must have length T and scores length T+1 for every episode of the source dataset")
     if not all(np.isfinite(array).all() for array in (*rewards, *scores)):
         raise BadInput("rewards and scores must be finite, got NaN or infinity")
-    with artifacts.lock(final):
-        if exists(dataset_id):
-            raise BadInput(f"dataset {dataset_id} exists already; choose another name or delete {final}")
-        artifacts.check_free_space(final.parent, 2 * trajectories.n_bytes)
-        with artifacts.staged_folder(final) as staging:
-            scored = [_scored(*new) for new in zip(rewards, scores, trajectories.rewards_to_keep(), strict=True)]
-            _in_child(_build_scored, trajectories, staging, scored)
-            metadata = artifacts.read_json(staging / METADATA_FILE)
-            _set_metadata(
-                staging / METADATA_FILE,
-                dataset_id=dataset_id,
-                description=f"{metadata.get('description', '')} {description}".strip(),
-                zest={**metadata.get("zest", {}), **zest},
-            )
-            extra(staging)
-            meant = ({**old, **new} for old, new in zip(trajectories.written(), scored, strict=True))
-            _publish(staging, dataset_id, meant)
-    return final
+    with _staged(dataset_id, 2 * trajectories.n_bytes) as staging:
+        scored = [_scored(*new) for new in zip(rewards, scores, trajectories.rewards_to_keep(), strict=True)]
+        _in_child(_build_scored, trajectories, staging, scored)
+        metadata = artifacts.read_json(staging / METADATA_FILE)
+        _set_metadata(
+            staging / METADATA_FILE,
+            dataset_id=dataset_id,
+            description=f"{metadata.get('description', '')} {description}".strip(),
+            zest={**metadata.get("zest", {}), **zest},
+        )
+        extra(staging)
+        _seal(staging, dataset_id, ({**old, **new} for old, new in zip(trajectories.written(), scored, strict=True)))
+    return dataset_path(dataset_id)

@@ -1,1 +1,1 @@
-"""Pure functions: statistics of returns, what a reward is worth, how well a selection finds its frames."""
+"""Pure functions: statistics of returns, quality of a reward, quality of a selection of frames."""

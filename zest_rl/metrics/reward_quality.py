@@ -1,8 +1,8 @@
-"""How much a reward is worth before anything is trained on it: pure functions of scores, states and ground truth.
+"""Quality of a reward before anything is trained on it: pure functions of scores, states and ground truth.
 
-Ground truth is for judging a reward, never for making one; what needs none is marked so. Every figure comes with a 95 %
-bootstrap interval over episodes. A score here is that of the frames after each action, (T,) per episode: the rewards of
-an episode when these are levels.
+Ground truth judges a reward and never makes one; figures that need none say so. Every figure comes with a 95 %
+bootstrap interval over episodes. Scores are those of the frames after each action, (T,) per episode: the rewards of an
+episode when these are levels.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SATURATED_BAND = 0.05
 """Scores this near (as a share of their range) to the lowest or highest one count as saturated."""
 
 
-def _each_with(what: str, scores: Sequence[NDArray[np.generic]], others: Sequence[NDArray[np.generic]]) -> None:
+def _check_pairs(what: str, scores: Sequence[NDArray[np.generic]], others: Sequence[NDArray[np.generic]]) -> None:
     if not scores:
         raise BadInput("a reward can be judged on at least 1 episode, got 0; use a dataset with episodes")
     for i, (score, other) in enumerate(zip(scores, others, strict=True)):
@@ -30,8 +30,13 @@ def _each_with(what: str, scores: Sequence[NDArray[np.generic]], others: Sequenc
             )
 
 
+def _mean_over_episodes(values: Sequence[float]) -> Estimate:
+    array = np.array(values)
+    return over_episodes(lambda i: float(array[i].mean()), len(array))
+
+
 def _mean_over_frames(shares: Values, scores: Sequence[NDArray[np.generic]]) -> Estimate:
-    """Average what was measured per episode (N,), each counting as many times as it has frames."""
+    """Average a figure of each episode (N,), weighted by its number of frames."""
     lengths = np.array([len(score) for score in scores])
     return over_episodes(lambda i: float(np.average(shares[i], weights=lengths[i])), len(scores))
 
@@ -49,24 +54,20 @@ def value_order(scores: Sequence[FloatArray]) -> Estimate:
     """
     from scipy import stats
 
-    _each_with("scores", scores, scores)
-    orders = np.array(
-        [
-            0.0 if np.ptp(score) == 0 else float(stats.spearmanr(score, np.arange(len(score))).statistic)
-            for score in scores
-        ]
+    _check_pairs("scores", scores, scores)
+    return _mean_over_episodes(
+        [0.0 if np.ptp(score) == 0 else stats.spearmanr(score, np.arange(len(score))).statistic for score in scores]
     )
-    return over_episodes(lambda i: float(orders[i].mean()), len(orders))
 
 
-def share_told_by_step(scores: Sequence[FloatArray]) -> Estimate:
-    """Share of the scores' variance that the number of the step alone tells, in [0, 1]. No ground truth.
+def share_explained_by_step(scores: Sequence[FloatArray]) -> Estimate:
+    """Share of the scores' variance that the step number alone explains, in [0, 1]. No ground truth.
 
-    Near 1 the reward is a clock: whatever the robot does, the score at step t is the same. Each episode's scores are
-    told by the mean of the *other* episodes at the same step, against their mean over all steps: 1 − Σ squared error /
-    Σ squared distance, at least 0. NaN for constant scores, and for a single episode.
+    Near 1 the reward is a clock: whatever the robot does, the score at step t is the same. An episode's scores are
+    predicted by the mean of the *other* episodes at the same step, compared with their mean over all steps:
+    1 − Σ squared error / Σ squared distance, at least 0. NaN for constant scores, and for a single episode.
     """
-    _each_with("scores", scores, scores)
+    _check_pairs("scores", scores, scores)
     length = max(map(len, scores))
     padded = np.full((len(scores), length), np.nan)
     for row, score in zip(padded, scores, strict=True):
@@ -89,16 +90,15 @@ def share_told_by_step(scores: Sequence[FloatArray]) -> Estimate:
     return over_episodes(share, len(scores))
 
 
-def straight_in_time(scores: Sequence[FloatArray]) -> Estimate:
-    """Share of an episode's variance that a straight line in time tells, averaged over episodes. No ground truth.
+def linear_trend_r2(scores: Sequence[FloatArray]) -> Estimate:
+    """R² of a linear trend of score over time (Pearson's ρ²), averaged over episodes. No ground truth.
 
-    Pearson's ρ² of score and step. Episodes whose scores are constant, or that have one step, count as 0.
+    Episodes whose scores are constant, or that have one step, count as 0.
     """
-    _each_with("scores", scores, scores)
-    shares = np.array(
+    _check_pairs("scores", scores, scores)
+    return _mean_over_episodes(
         [0.0 if np.ptp(score) == 0 else np.corrcoef(score, np.arange(len(score)))[0, 1] ** 2 for score in scores]
     )
-    return over_episodes(lambda i: float(shares[i].mean()), len(shares))
 
 
 def share_saturated(scores: Sequence[FloatArray]) -> Estimate:
@@ -106,7 +106,7 @@ def share_saturated(scores: Sequence[FloatArray]) -> Estimate:
 
     NaN for constant scores.
     """
-    _each_with("scores", scores, scores)
+    _check_pairs("scores", scores, scores)
     every = np.concatenate(scores)
     low, high = float(every.min()), float(every.max())
     if low == high:
@@ -116,21 +116,20 @@ def share_saturated(scores: Sequence[FloatArray]) -> Estimate:
     return _mean_over_frames(shares, scores)
 
 
-def share_still(still: Sequence[NDArray[np.bool_]]) -> Estimate:
-    """Share of the frames after the first (T,) that show what the first one shows: nothing to be seen there yet.
+def share_unchanged(still: Sequence[NDArray[np.bool_]]) -> Estimate:
+    """Share of unchanged frames: of the frames after the first, (T,) per episode, those equal to it. No ground truth.
 
-    Averaged over episodes. No ground truth.
+    Averaged over episodes.
     """
-    shares = np.array([episode.mean() for episode in still])
-    return over_episodes(lambda i: float(shares[i].mean()), len(shares))
+    return _mean_over_episodes([episode.mean() for episode in still])
 
 
 def share_contradictory(scores: Sequence[FloatArray], states: Sequence[NDArray[np.float64]]) -> Estimate:
-    """Share of frames that score otherwise than an equal state (T, nq) of the same episode. No ground truth.
+    """Share of frames whose score differs from that of an equal state (T, nq) in the same episode. No ground truth.
 
-    0 for any reward that is a function of what is seen now and at the start; scores of other episodes are not.
+    0 for any reward that is a function of the current and the first frame alone.
     """
-    _each_with("states", scores, states)
+    _check_pairs("states", scores, states)
     shares = []
     for score, episode in zip(scores, states, strict=True):
         _, first, group = np.unique(episode, axis=0, return_index=True, return_inverse=True)
@@ -162,7 +161,7 @@ def pairwise_accuracy(returns: Values, truth: Values) -> Estimate:
 
 
 def average_precision(returns: Values, success: NDArray[np.bool_]) -> Estimate:
-    """Area under the precision-recall curve of telling successes (N,) bool by their return; chance is their share.
+    """Area under the precision-recall curve of predicting success (N,) bool by return; chance is their share.
 
     Σ over thresholds of (R_k − R_{k−1}) · P_k, equal returns at one threshold. NaN without a success.
     """
@@ -187,19 +186,19 @@ def epic_distance(scores: Sequence[FloatArray], truth: Sequence[FloatArray]) -> 
     """EPIC distance of two rewards on the dataset's transitions, in [0, 1]; 0: equal up to scale and offset.
 
     √((1 − ρ) / 2), ρ Pearson's correlation over all transitions (Gleave et al. 2021, https://arxiv.org/abs/2006.13900).
-    Both rewards depend on the next state alone, which makes the canonical shaping of that paper a constant that the
-    correlation does not see. NaN where one reward is constant.
+    Both rewards depend on the next state alone, so the canonical shaping of that paper is a constant, to which the
+    correlation is invariant. NaN where one reward is constant.
 
     Args:
         scores: (T,) per episode.
         truth: (T,) per episode, the ground-truth rewards.
     """
-    _each_with("ground-truth rewards", scores, truth)
+    _check_pairs("ground-truth rewards", scores, truth)
     every = [np.asarray(np.concatenate(rewards), dtype=np.float64) for rewards in (scores, truth)]
-    offsets, largest = [one.mean() for one in every], [np.abs(one).max() for one in every]
+    offsets, largest = [values.mean() for values in every], [np.abs(values).max() for values in every]
     sums = np.empty((len(scores), 6))
-    for row, one, other in zip(sums, scores, truth, strict=True):
-        a, b = one - offsets[0], other - offsets[1]
+    for row, score, reward in zip(sums, scores, truth, strict=True):
+        a, b = score - offsets[0], reward - offsets[1]
         row[:] = len(a), a.sum(), b.sum(), (a * a).sum(), (b * b).sum(), (a * b).sum()
 
     def distance(i: NDArray[np.intp]) -> float:

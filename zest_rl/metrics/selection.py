@@ -1,7 +1,7 @@
-"""Goal and action selection: does a score find, in a dataset, the frames that reach a goal? Pure functions.
+"""Goal and action selection: how well a score finds the frames of a dataset that reach a goal. Pure functions.
 
-Cui et al. 2022, §4. Candidates are frames of a dataset; I(x) says which of them satisfy the goal (by ground truth: this
-judges a score, it makes none); μ is their number.
+Cui et al. 2022, §4. Candidates are frames of a dataset; I(x) says which of them satisfy the goal by ground truth, which
+judges a score here and never makes one; μ is their number.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from zest_rl.errors import BadInput
 from zest_rl.metrics.statistics import Estimate, Values, over_episodes
 
 Measure = Callable[[Values, NDArray[np.bool_]], float]
-"""Of scores (M,) and which candidates satisfy the goal (M,)."""
+"""Scores (M,) and which candidates satisfy the goal (M,) → a number."""
 TOP_N = 25
 """N of the paper's tables."""
 
@@ -34,12 +34,12 @@ def _check(scores: Values, satisfies: NDArray[np.bool_]) -> tuple[Values, NDArra
 def top_n_success(scores: Values, satisfies: NDArray[np.bool_], n: int = TOP_N) -> float:
     """Share of the N highest-scoring candidates that satisfy the goal, in [0, 1] (§4.1). Chance is `goal_frame_ratio`.
 
-    Candidates with equal scores share the places that they compete for, so that their order says nothing.
+    Candidates with equal scores share the places that they compete for, so that their order does not matter.
 
     Args:
         scores: (M,) of the candidates.
         satisfies: (M,) bool, which of them satisfy the goal.
-        n: how many are picked; at most μ, or even a perfect score could not fill the places.
+        n: how many are picked; at most μ, else even a perfect score could not reach 1.
 
     Raises:
         BadInput: lengths differ, no candidate satisfies the goal, or `n` is not in [1, μ].
@@ -56,20 +56,20 @@ def top_n_success(scores: Values, satisfies: NDArray[np.bool_], n: int = TOP_N) 
 
 
 def top_up_to(scores: Values, satisfies: NDArray[np.bool_], n: int = TOP_N) -> float:
-    """`top_n_success` of the N or, where fewer candidates satisfy the goal, of that many: for resampled candidates."""
+    """`top_n_success` with N lowered to μ where μ is smaller, as it may be among resampled candidates."""
     return top_n_success(scores, satisfies, min(n, int(np.sum(satisfies))))
 
 
 def goal_frame_ratio(satisfies: NDArray[np.bool_]) -> float:
-    """Share of the candidates that satisfy the goal, which is what picking at random finds."""
+    """Share of the candidates that satisfy the goal: the expected result of picking at random."""
     return float(np.mean(satisfies))
 
 
 def dataset_total_variation(scores: Values, satisfies: NDArray[np.bool_]) -> float:
-    """DTV = (1/M) Σ_i | I(x_i)/μ − φ_i / Σ_j φ_j | (Eq. 3); 0 is best, 2/M the most there can be.
+    """DTV = (1/M) Σ_i | I(x_i)/μ − φ_i / Σ_j φ_j | (Eq. 3); 0 is best, 2/M the maximum.
 
-    The paper does not say how scores below 0 enter a sum that is to be a distribution: here all are shifted so that the
-    lowest is 0. Scores that are all equal count as the uniform distribution.
+    The paper does not say how negative scores become a distribution: here all are shifted so that the lowest is 0.
+    Scores that are all equal count as the uniform distribution.
 
     Args:
         scores: (M,) of the candidates.
@@ -86,12 +86,12 @@ def dataset_total_variation(scores: Values, satisfies: NDArray[np.bool_]) -> flo
 
 
 def relative_variation(scores: Values, satisfies: NDArray[np.bool_]) -> float:
-    """`dataset_total_variation` over its largest value: in [0, 1], and comparable between datasets of other sizes."""
+    """`dataset_total_variation` over its maximum: in [0, 1], and comparable between datasets of different sizes."""
     return dataset_total_variation(scores, satisfies) * len(np.asarray(scores)) / 2
 
 
-def others(n: int, seed: int) -> NDArray[np.intp]:
-    """Draw for each of n >= 2 trajectories another one, never itself: (n,)."""
+def draw_others(n: int, seed: int) -> NDArray[np.intp]:
+    """Draw for each of n >= 2 trajectories another one: (n,) indices, none its own."""
     return (np.arange(n) + np.random.default_rng(seed).integers(1, n, size=n)) % n
 
 
@@ -103,15 +103,15 @@ def over_trajectories(
     *,
     n_resamples: int = 1000,
 ) -> Estimate:
-    """A measure, averaged over R ways of scoring, with its 95 % bootstrap interval over trajectories.
+    """Estimate a measure, averaged over R ways of scoring, with a 95 % bootstrap interval over trajectories.
 
-    Whole trajectories are resampled, as the frames of one are much alike.
+    Whole trajectories are resampled, because the frames of one are correlated.
 
     Args:
-        measure: such as `top_n_success`; resamples that it refuses are left out.
+        measure: such as `top_n_success`; resamples for which it raises `BadInput` are left out.
         scores: (R, M) of the candidates, for instance by R samples of the goal's pictures.
         satisfies: (M,) bool.
-        trajectory: (M,) which trajectory each candidate is of.
+        trajectory: (M,) of each candidate.
         n_resamples: number of bootstrap samples.
     """
     names, group = np.unique(trajectory, return_inverse=True)
@@ -125,5 +125,5 @@ def over_trajectories(
             return float("nan")
 
     for row in scores:
-        measure(row, satisfies)  # what is wrong with the whole is no matter of resampling, and is refused
+        measure(row, satisfies)  # raises where the whole set, not a resample, is at fault
     return over_episodes(measured, len(names), n_resamples=n_resamples)

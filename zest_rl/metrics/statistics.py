@@ -15,7 +15,7 @@ Statistic = Callable[[Values], Values]
 N_RESAMPLES, BLOCK = 10_000, 200
 """Bootstrap samples, and how many are in memory at a time."""
 MIN_EPISODES_TO_RANK = 3
-"""Fewer have no rank correlation worth telling."""
+"""With fewer, a rank correlation means nothing."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Estimate:
     high: float
 
     def as_json(self) -> dict[str, float | list[float]]:
-        """What a verb's result holds of it."""
+        """The form that it has in the result of a verb."""
         return {"value": self.value, "ci95": [self.low, self.high]}
 
 
@@ -64,8 +64,8 @@ def bootstrap(
     these tasks (Agarwal et al. 2021, https://arxiv.org/abs/2108.13264).
 
     Args:
-        tasks: of each task one (N,) array per training seed; as many seeds and episodes for every task.
-        statistic: of all values together, over the last axis.
+        tasks: for each task one (N,) array per training seed; equally many seeds and episodes for all tasks.
+        statistic: over the last axis, of all values together.
         seed: of the resampling.
         n_resamples: number of bootstrap samples.
 
@@ -95,7 +95,7 @@ def bootstrap(
 def over_episodes(
     statistic: Callable[[NDArray[np.intp]], float], n: int, *, seed: int = 0, n_resamples: int = 1000
 ) -> Estimate:
-    """A statistic of n episodes with its 95 % percentile bootstrap over them.
+    """Estimate a statistic of n episodes, with a 95 % percentile bootstrap over them.
 
     Args:
         statistic: of the episodes with these indices, (n,), some more than once; NaN where it is undefined.
