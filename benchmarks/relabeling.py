@@ -30,7 +30,7 @@ from zest_rl.kitchen.views import Views, distinct_states
 from zest_rl.rewards import state_embeddings
 from zest_rl.rewards.relabel import relabel_source
 from zest_rl.rewards.scorer import ScorerConfig
-from zest_rl.rewards.state_embeddings import STATES_PER_SHARD, EmbedConfig, StateEmbedder
+from zest_rl.rewards.state_embeddings import STATES_PER_SHARD, StateEmbedder
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import concatenate, write_arrays
@@ -114,7 +114,7 @@ def relabel_ms(episodes: dict[str, NDArray[Any]]) -> tuple[float, float]:
 
 def fill_cache(embedded: NDArray[np.float64], states: NDArray[np.float64]) -> int:
     """Give all of `states` (N, 30) the embeddings of those that are `embedded`, in turn; return how many differ."""
-    cache = StateEmbedder(EmbedConfig(VIEWS, CONFIG.embedder))
+    cache = StateEmbedder(VIEWS, CONFIG.embedder)
     vectors = cache.embedded(embedded).embeddings[1:]
     distinct = distinct_states(states, VIEWS)
     for path in cache.folder.glob("*.npz"):

@@ -13,7 +13,7 @@ from PIL import Image
 
 from zest_rl.kitchen.views import Views
 from zest_rl.rewards.frame_embeddings import FrameEmbeddings
-from zest_rl.rewards.state_embeddings import EmbedConfig, StateEmbedder, StateEmbeddings
+from zest_rl.rewards.state_embeddings import StateEmbedder, StateEmbeddings
 from zest_rl.sources import Source, open_source
 from zest_rl.sources.kitchen import KitchenStates, kitchen_source
 from zest_rl.sources.videos import EpisodeVideos
@@ -74,9 +74,7 @@ def test_the_kitchen_embedded_by_distinct_states_is_the_kitchen_embedded_frame_b
     source = kitchen_source(collected, Views("micro", n_views=2, size=96, tolerance=0.05))
     frames = source.frames
     assert isinstance(frames, KitchenStates)
-    by_state = StateEmbeddings(
-        StateEmbedder(EmbedConfig(frames.ring, "efficientnet-lite0"), n_workers=1), frames.states
-    )
+    by_state = StateEmbeddings(StateEmbedder(frames.ring, "efficientnet-lite0", n_workers=1), frames.states)
     by_frame = FrameEmbeddings(source, "efficientnet-lite0", n_workers=1)
     for embeddings in (by_state, by_frame):
         embeddings.embed()

@@ -154,7 +154,7 @@ def test_the_metadata_tells_how_the_rewards_were_made(relabeled: Relabeled) -> N
     assert facts["source_sha256"] == read(SOURCE, Dataset.fingerprint)
     assert facts["reward"] == "level"
     assert facts["scorer"]["config"] == {"views": asdict(VIEWS), **asdict(CONFIG)}
-    assert facts["scorer"] == json.loads(json.dumps(relabeled.scorer.describe()))
+    assert facts["scorer"] == json.loads(json.dumps(relabeled.scorer.record.to_json()))
     assert facts["n_still_frames"] == relabeled.n_still > 100
     assert {"torch", "mujoco", "timm", "zest-rl"} <= set(facts["provenance"]["versions"])
 
@@ -250,7 +250,7 @@ def test_of_two_equal_calls_at_once_the_second_finds_the_work_done(collected: st
 
 ZEST = "import sys; from zest_rl.cli import main; sys.exit(main())"
 DIE_WHILE_WRITING = (
-    f"import os; from zest_rl.rewards import relabel as r; r._leave_scorer = lambda *_: os.kill(os.getpid(), 9); {ZEST}"
+    f"import os; from zest_rl.rewards import relabel as r; r._write_scorer = lambda *_: os.kill(os.getpid(), 9); {ZEST}"
 )
 
 

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -189,7 +189,7 @@ def test_a_saved_scorer_gives_the_same_bits_and_needs_no_goal(
     loaded = StateScorer.load(tmp_path / "scorer.safetensors", n_workers=1)
     assert (loaded.scorer.config, loaded.scorer.views) == (CONFIG, VIEWS)
     assert loaded.scorer.goal is None
-    assert loaded.scorer.describe() == scorer.scorer.describe()
+    assert loaded.scorer.record == scorer.scorer.record
     assert loaded.scorer.fingerprint() == scorer.scorer.fingerprint()
     for ours, theirs in zip(score_all(loaded, episodes)[0], score_all(scorer, episodes)[0], strict=True):
         np.testing.assert_array_equal(ours, theirs)
@@ -233,7 +233,7 @@ def test_a_scorer_of_another_precision_or_other_views_is_refused(scorer: StateSc
         Scorer.load(path)
     assert not isinstance(caught.value, BadInput)
     scorer.scorer.save(path)
-    rewrite(path, views={**scorer.scorer.describe()["config"]["views"], "size": 64})
+    rewrite(path, views=asdict(replace(VIEWS, size=64)))
     with pytest.raises(ZestError, match="made with another views"):
         Scorer.load(path)
 

@@ -17,7 +17,6 @@ from zest_rl.rewards.scores import (
     pair_starts,
     score_classifier,
     score_delta,
-    score_progress,
     score_projection,
     score_raw,
     score_views,
@@ -143,12 +142,12 @@ def test_a_view_that_hardly_shows_the_goal_hardly_counts_for_progress() -> None:
 def test_rewards_to_compare_with_end_best_at_the_goal() -> None:
     start, goal = np.array([[1.0, 0.2, 0.1]], np.float32), np.array([[0.1, 1.0, 0.3]], np.float32)
     frames = np.concatenate([start, (start + goal) / 2, goal])
-    assert score_progress(frames, goal) == pytest.approx([0, 0.5, 1])
+    assert score_views(frames[:, None], start, goal, "progress") == pytest.approx([0, 0.5, 1])
     assert score_classifier(frames, start, goal)[[0, 2]] == pytest.approx([0, 1], abs=1e-6)
     projected = score_projection(frames, start, goal)
     assert (np.diff(projected) > 0).all()
     assert projected[-1] == pytest.approx(1)
-    assert score_progress(goal, goal) == [0], "an episode that starts at the goal"
+    assert score_views(goal[:, None], start, goal, "progress") == [0], "an episode that starts at the goal"
 
 
 def test_the_projections_alpha_goes_from_the_plain_distance_to_the_way_alone() -> None:
@@ -266,7 +265,7 @@ def test_raw_scores_and_pairs_refuse_such_arrays_too() -> None:
     with pytest.raises(BadInput, match="goal_embeddings must have the frames' dimension D = 3, got 2"):
         score_raw(FRAMES, ONE[:, :2])
     with pytest.raises(BadInput, match="start_embeddings must have the frames' dimension D = 3, got 2"):
-        pair_starts(ONE[:, :2], ONE)
+        score_delta(FRAMES, ONE[:, :2], ONE)
     with pytest.raises(BadInput, match="frame_embeddings must be finite"):
         zero_deltas(NAN)
 

@@ -6,6 +6,7 @@ import tracemalloc
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,12 +17,12 @@ from zest_rl.errors import ZestError
 from zest_rl.kitchen.env import KitchenEnv
 from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.rewards import state_embeddings
-from zest_rl.rewards.state_embeddings import STATES_PER_SHARD, EmbedConfig, StateEmbedder
+from zest_rl.rewards.state_embeddings import STATES_PER_SHARD, StateEmbedder
 from zest_rl.runtime.arrays import write_arrays
 from zest_rl.runtime.parallel import chunks, one_thread
 
 VIEWS = Views("micro", n_views=2, size=96)
-CONFIG = EmbedConfig(VIEWS, "efficientnet-lite0")
+EMBEDDER = "efficientnet-lite0"
 MICROWAVE, ELBOW = 22, 3
 """Places in qpos."""
 
@@ -39,8 +40,8 @@ def opening(n: int, last: float = -0.75) -> np.ndarray:
     return states
 
 
-def single(config: EmbedConfig = CONFIG) -> StateEmbedder:
-    return StateEmbedder(config, n_workers=1)
+def single(views: Views = VIEWS, embedder: str = EMBEDDER, **options: Any) -> StateEmbedder:
+    return StateEmbedder(views, embedder, n_workers=1, **options)
 
 
 def embedded(embedder: StateEmbedder, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +89,7 @@ def test_what_was_embedded_is_taken_from_the_cache_by_the_same_object_and_by_the
 
 
 def test_progress_is_told_in_shards_and_only_for_what_is_missing() -> None:
-    embedder = single(replace(CONFIG, views=replace(VIEWS, n_views=1, size=32)))
+    embedder = single(replace(VIEWS, n_views=1, size=32))
     told: list[tuple[int, int]] = []
     states = opening(STATES_PER_SHARD + 1)
     embedder.embed(states, lambda done, total: told.append((done, total)))
@@ -193,7 +194,7 @@ def test_two_worker_processes_give_the_bits_of_one_and_end_quietly(
     here, _ = embedded(single(), states)
     monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "of two"))
     monkeypatch.setattr(state_embeddings, "STATES_PER_SHARD", 2)
-    spread = StateEmbedder(CONFIG, n_workers=2)
+    spread = StateEmbedder(VIEWS, EMBEDDER, n_workers=2)
     there, _ = embedded(spread, states)
     assert len(list(spread.folder.glob("*.npz"))) == 3
     np.testing.assert_array_equal(there, here)
@@ -230,17 +231,17 @@ def test_embeddings_do_not_depend_on_torchs_threads_and_leave_them_alone(
 
 
 def test_other_views_networks_or_precisions_have_another_cache_and_another_device_has_not() -> None:
-    configs = [
-        CONFIG,
-        replace(CONFIG, views=replace(VIEWS, n_views=3)),
-        replace(CONFIG, views=replace(VIEWS, task="sdoor")),
-        replace(CONFIG, views=replace(VIEWS, robot=True)),
-        replace(CONFIG, views=replace(VIEWS, tolerance=0)),
-        replace(CONFIG, precision="bf16"),
+    embedders = [
+        single(),
+        single(replace(VIEWS, n_views=3)),
+        single(replace(VIEWS, task="sdoor")),
+        single(replace(VIEWS, robot=True)),
+        single(replace(VIEWS, tolerance=0)),
+        single(precision="bf16"),
     ]
-    folders = [single(config).folder for config in configs]
-    assert len(set(folders)) == len(configs)
-    assert single(replace(CONFIG, device="cpu")).folder == folders[0]
+    folders = [embedder.folder for embedder in embedders]
+    assert len(set(folders)) == len(embedders)
+    assert single(device="cpu").folder == folders[0]
 
 
 def test_equal_weights_share_a_cache_and_other_weights_do_not(tmp_path: Path) -> None:
@@ -250,5 +251,5 @@ def test_equal_weights_share_a_cache_and_other_weights_do_not(tmp_path: Path) ->
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
         torch.manual_seed(seed)
         torch.save(timm.create_model("resnet10t", pretrained=False).state_dict(), tmp_path / f"{name}.pth")
-        folders.append(single(replace(CONFIG, embedder=f"timm:resnet10t@{tmp_path / name}.pth")).folder)
+        folders.append(single(embedder=f"timm:resnet10t@{tmp_path / name}.pth").folder)
     assert folders[0] == folders[1] != folders[2]

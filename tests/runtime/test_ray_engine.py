@@ -14,7 +14,7 @@ from read_dataset import read
 
 from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.rewards.embeddings import check_same_embedder, shared_embedder
+from zest_rl.rewards.embeddings import WorkerEmbedder, shared_embedder
 from zest_rl.runtime import ray_engine
 from zest_rl.runtime.arrays import Arrays, read_arrays
 from zest_rl.runtime.parallel import cached_jobs
@@ -161,9 +161,10 @@ def test_an_unknown_engine_is_an_error(tmp_path: Path) -> None:
 
 def test_an_embedder_that_is_another_on_the_worker_is_refused() -> None:
     embedder = shared_embedder("efficientnet-lite0", "fp32", "cpu")
-    check_same_embedder(embedder, embedder.fingerprint)
+    assert WorkerEmbedder("efficientnet-lite0", "fp32", "cpu", embedder.fingerprint).load() is embedder
+    other = shared_embedder("efficientnet-lite0", "bf16", "cpu").fingerprint
     with pytest.raises(BadInput, match="is not that of the process that asked"):
-        check_same_embedder(embedder, shared_embedder("efficientnet-lite0", "bf16", "cpu").fingerprint)
+        WorkerEmbedder("efficientnet-lite0", "fp32", "cpu", other).load()
 
 
 def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

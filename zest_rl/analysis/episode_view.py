@@ -59,7 +59,7 @@ class EpisodeView:
 
     def _render(self, states: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
         """Render each distinct state once: (U, V, H, W, 3), and which of them each state is."""
-        views = self.scorer.embedder.config.views
+        views = self.scorer.embedder.views
         distinct, index = np.unique(canonical_states(states, views), axis=0, return_inverse=True)
         return np.stack([views.shared_renderer().render(state) for state in distinct]), index.reshape(-1)
 

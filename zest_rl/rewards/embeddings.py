@@ -17,12 +17,12 @@ from zest_rl.types import FloatArray
 
 @dataclass(frozen=True)
 class EmbeddedEpisode:
-    """The frames of one episode of T steps, embedded; frames that are known to be equal may be there once."""
+    """The embedded frames of one episode of T steps; frames known to be equal may be stored once."""
 
     embeddings: FloatArray
     """(U, V, D) of V views, that of x_0 first."""
     index: NDArray[np.intp]
-    """(T+1,) which of them shows x_0, x_1, … x_T."""
+    """(T+1,) rows of `embeddings` for x_0, x_1, … x_T."""
 
     @property
     def ends(self) -> FloatArray:
@@ -34,39 +34,51 @@ class EpisodeEmbeddings(Protocol):
     """The embeddings of all episodes of a dataset, through a cache on disk."""
 
     unit: ClassVar[str]
-    """What is embedded and cached as a whole."""
+    """What one entry of the cache holds."""
 
     @property
     def n_embedded(self) -> int:
         """Units that were not in the cache."""
 
     def identity(self) -> list[Any]:
-        """What the embeddings depend on besides the recorded episodes and the scorer, for hashes; JSON-ready."""
+        """JSON-ready, for hashes: what the embeddings depend on besides the recorded episodes and the scorer."""
 
     def describe(self) -> dict[str, Any]:
-        """Where the frames come from, for provenance; JSON-ready."""
+        """JSON-ready, for provenance: where the frames come from."""
 
     def embed(self, on_progress: Callable[[int, int], None] | None = None) -> None:
-        """Leave all embeddings in the cache; `on_progress` is called with (parts embedded, parts in all)."""
+        """Fill the cache; `on_progress` is called with (parts embedded, parts in all)."""
 
     def __iter__(self) -> Iterator[EmbeddedEpisode]:
-        """Yield what `embed` left, one episode in memory at a time."""
+        """Read the cache, one episode in memory at a time."""
 
 
 @functools.lru_cache(maxsize=2)
 def shared_embedder(uri: str, precision: Precision, device: str) -> Embedder:
-    """Return this process's embedder of a URI, see `load_embedder`."""
+    """Return this process's embedder of a URI; the default's network is loaded at its first picture."""
     return load_embedder(uri, device=device, precision=precision)
 
 
-def check_same_embedder(embedder: Embedder, fingerprint: str) -> None:
-    """Make sure that a worker's embedder is that of the process that asked: the cache goes by the latter.
+@dataclass(frozen=True)
+class WorkerEmbedder:
+    """An embedder as jobs carry it to worker processes, which load it there."""
 
-    Raises:
-        BadInput: weights, precision or versions differ between the machines.
-    """
-    if embedder.fingerprint != fingerprint:
-        raise BadInput(
-            f"embedder {embedder.uri} of this worker is not that of the process that asked: weights, precision or "
-            "versions differ; install the same on every node, and choose --precision fp32 or bf16"
-        )
+    uri: str
+    precision: Precision
+    device: str
+    fingerprint: str
+    """Of the embedder of the process that asks; it names the cache."""
+
+    def load(self) -> Embedder:
+        """Return this process's embedder.
+
+        Raises:
+            BadInput: weights, precision or versions differ between the machines.
+        """
+        embedder = shared_embedder(self.uri, self.precision, self.device)
+        if embedder.fingerprint != self.fingerprint:
+            raise BadInput(
+                f"embedder {self.uri} of this worker is not that of the process that asked: weights, precision or "
+                "versions differ; install the same on every node, and choose --precision fp32 or bf16"
+            )
+        return embedder

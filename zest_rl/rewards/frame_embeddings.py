@@ -1,7 +1,7 @@
-"""Frames of any source → embeddings of all views, one file of the cache per episode, named by its content.
+"""Frames of any source → embeddings of all views, one file in the cache per episode, named by a hash of its frames.
 
-Frames are embedded episode by episode, a few steps at a time: memory does not grow with the dataset, and a cut run goes
-on at the episode where it was cut.
+Frames are embedded episode by episode, a few steps at a time: memory does not grow with the dataset, and an interrupted
+run resumes at the episode where it stopped.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from zest_rl.embedders import Precision
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.rewards.embeddings import EmbeddedEpisode, check_same_embedder, shared_embedder
+from zest_rl.rewards.embeddings import EmbeddedEpisode, WorkerEmbedder, shared_embedder
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_arrays
 from zest_rl.runtime.parallel import Engine, cached_jobs, one_thread
@@ -29,14 +29,10 @@ STEPS_PER_BATCH = 16
 
 @dataclass(frozen=True)
 class _Shared:
-    """What the jobs have in common: with the paths of all episodes, it is sent to a worker once and not with each."""
+    """What all jobs share; it holds the paths of all episodes, so it is sent once to a worker and not with each job."""
 
     frames: EpisodeFrames
-    embedder: str
-    precision: Precision
-    device: str
-    fingerprint: str
-    """Of the embedder."""
+    embedder: WorkerEmbedder
 
 
 @dataclass(frozen=True)
@@ -48,9 +44,8 @@ class _Job:
 
 
 def _embed_episode(shared: _Shared, job: _Job) -> dict[str, NDArray[np.generic]]:
-    embedder = shared_embedder(shared.embedder, shared.precision, shared.device)
-    check_same_embedder(embedder, shared.fingerprint)
-    steps = islice(shared.frames.read(job.episode), job.n_steps + 2)  # one more than may be shows that it is wrong
+    embedder = shared.embedder.load()
+    steps = islice(shared.frames.read(job.episode), job.n_steps + 2)  # one more than allowed, to notice too many
     parts = []
     with one_thread():
         while batch := list(islice(steps, STEPS_PER_BATCH)):
@@ -58,10 +53,10 @@ def _embed_episode(shared: _Shared, job: _Job) -> dict[str, NDArray[np.generic]]
             parts.append(vectors.reshape(len(batch), -1, embedder.dim))
     n_frames = sum(map(len, parts))
     if n_frames not in (job.n_steps, job.n_steps + 1):
-        found = f"more than {job.n_steps + 1}" if n_frames > job.n_steps else str(n_frames)
+        number = f"more than {job.n_steps + 1}" if n_frames > job.n_steps else str(n_frames)
         raise BadInput(
             f"episode {job.episode} has {job.n_steps} actions, so it needs {job.n_steps + 1} frames (x_0 … x_T), or "
-            f"{job.n_steps} without the last; got {found}. Are these the frames of this episode, one for each step?"
+            f"{job.n_steps} without the last; got {number}. Are these the frames of this episode, one for each step?"
         )
     return {"embeddings": np.concatenate(parts)}
 
@@ -85,9 +80,9 @@ class FrameEmbeddings:
 
         Args:
             source: the dataset.
-            embedder: its URI.
+            embedder: its URI; `precision` and `device` as in `zest_rl.embedders.load_embedder`.
             precision: of the embedder.
-            device: where the embedder runs.
+            device: of the embedder.
             n_workers: processes that embed, default one per core.
             engine: processes of this machine, or workers of a Ray cluster.
 
@@ -95,25 +90,25 @@ class FrameEmbeddings:
             BadInput: frames or the embedder cannot be read.
         """
         fingerprint = shared_embedder(embedder, precision, device).fingerprint
-        self._shared = _Shared(source.frames, embedder, precision, device, fingerprint)
+        self._shared = _Shared(source.frames, WorkerEmbedder(embedder, precision, device, fingerprint))
         self._source, self._n_workers, self._engine = source, n_workers, engine
         self._n_steps = source.trajectories.n_steps
         self._digests = [source.frames.digest(episode) for episode in range(len(self._n_steps))]
         self._folder: Path = artifacts.cache_dir() / "frames" / fingerprint[:20]
         self.n_embedded = 0
-        """Episodes that were not in the cache and had to be read and embedded."""
+        """Episodes that were not in the cache."""
 
     def identity(self) -> list[Any]:
-        """The rewards that the dataset came with, which a copy keeps, and the frames."""
+        """The original rewards, which a copy keeps, and the frames."""
         rewards = self._source.trajectories.rewards_to_keep()
         return [[None if r is None else artifacts.hash_arrays(r) for r in rewards], self._digests]
 
     def describe(self) -> dict[str, Any]:
-        """Where the frames are from, and their hash."""
+        """Origin of the frames, and their hash."""
         return {"frames": self._source.frames.describe(), "frames_sha256": artifacts.hash_json(self._digests)}
 
     def embed(self, on_progress: Callable[[int, int], None] | None = None) -> None:
-        """Leave the embeddings of all episodes in the cache; several processes at work on those that are missing.
+        """Embed the episodes that are not in the cache.
 
         Args:
             on_progress: called with (episodes embedded, episodes in all).
@@ -123,7 +118,7 @@ class FrameEmbeddings:
             ZestError: a worker process died; finished episodes are kept.
         """
         jobs = {
-            _name(digest): _Job(i, self._n_steps[i])
+            self._path(digest).stem: _Job(i, self._n_steps[i])
             for i, digest in enumerate(self._digests)
             if not self._path(digest).exists()
         }
@@ -133,7 +128,7 @@ class FrameEmbeddings:
             self._folder,
             n_workers=self._n_workers,
             engine=self._engine,
-            device=self._shared.device,
+            device=self._shared.embedder.device,
         )
         for n_done, _ in enumerate(embedded, start=len(self._digests) - len(jobs) + 1):
             if on_progress is not None:
@@ -141,7 +136,7 @@ class FrameEmbeddings:
         self.n_embedded += len(jobs)
 
     def __iter__(self) -> Iterator[EmbeddedEpisode]:
-        """Yield what `embed` left; a missing x_T repeats x_{T-1}.
+        """Read the cache; a missing x_T repeats x_{T-1}.
 
         Raises:
             BadInput: an episode has neither T nor T+1 frames.
@@ -159,8 +154,4 @@ class FrameEmbeddings:
             yield EmbeddedEpisode(whole, np.arange(n_steps + 1))
 
     def _path(self, digest: str) -> Path:
-        return self._folder / f"{_name(digest)}.npz"
-
-
-def _name(digest: str) -> str:
-    return digest[:32]
+        return self._folder / f"{digest[:32]}.npz"

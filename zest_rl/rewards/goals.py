@@ -5,8 +5,8 @@ A spec is one string:
 - ``same-scene``: the scene itself, rendered before and after; each camera view gets its own pair;
 - ``drawings``: the small drawings that come with the package;
 - a folder with ``init/`` and ``goal/``, each holding one or more pictures;
-- ``visual-tasks:real_imgs`` or ``visual-tasks:drawings``: the task's folder in the paper's Visual Tasks Dataset, which
-  the environment variable ZEST_VISUAL_TASKS points to;
+- ``visual-tasks:real_imgs`` or ``visual-tasks:drawings``: the task's folder in the paper's Visual Tasks Dataset, at the
+  path in the environment variable ZEST_VISUAL_TASKS;
 - ``text:closed microwave -> open microwave`` (several sentences are separated by ``|``);
 - ``text``: the task's own two sentences.
 """
@@ -28,7 +28,7 @@ from zest_rl.kitchen.views import Views, scene_pair
 from zest_rl.runtime import artifacts
 from zest_rl.types import Frame
 
-SAME_SCENE, DRAWINGS, VISUAL_TASKS, OWN_TEXT, TEXT = "same-scene", "drawings", "visual-tasks:", "text", "text:"
+SAME_SCENE, DRAWINGS, VISUAL_TASKS, TASK_TEXT, TEXT = "same-scene", "drawings", "visual-tasks:", "text", "text:"
 VISUAL_TASKS_VARIABLE = "ZEST_VISUAL_TASKS"
 
 
@@ -37,11 +37,11 @@ class GoalSpec:
     """Start and goal states as pictures or as sentences, one or several of each."""
 
     name: str
-    """The spec as it was written."""
+    """The spec as the user wrote it."""
     starts: tuple[Frame, ...] | tuple[str, ...]
     goals: tuple[Frame, ...] | tuple[str, ...]
     per_view: bool = False
-    """Picture v belongs to camera view v alone (same-scene goals)."""
+    """Each camera view v has its own pair, picture v of both (same-scene goals)."""
 
     def __post_init__(self) -> None:
         if not self.starts or not self.goals:
@@ -52,11 +52,11 @@ class GoalSpec:
 
     @property
     def is_text(self) -> bool:
-        """Sentences rather than pictures."""
+        """Whether starts and goals are sentences rather than pictures."""
         return isinstance(self.goals[0], str)
 
     def fingerprint(self) -> str:
-        """Hash of the content, whatever it was called."""
+        """Hash of the content; `name` does not matter."""
         parts = [
             [item if isinstance(item, str) else artifacts.hash_arrays(item) for item in items]
             for items in (self.starts, self.goals)
@@ -72,14 +72,13 @@ def read_folder(folder: Path, name: str | None = None) -> GoalSpec:
     """
     for part in ("init", "goal"):
         if not (folder / part).is_dir():
-            found = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else None
+            problem = "is not a folder"
+            if folder.is_dir():
+                contents = sorted(p.name for p in folder.iterdir())
+                problem = f"has no {part}/, it holds {', '.join(contents[:8]) or 'nothing'}"
             raise BadInput(
                 f"a goal folder must hold init/ (pictures of the start) and goal/ (pictures of the goal); {folder} "
-                + (
-                    "is not a folder"
-                    if found is None
-                    else f"has no {part}/, it holds {', '.join(found[:8]) or 'nothing'}"
-                )
+                + problem
             )
     starts, goals = (tuple(read_image(p) for p in list_images(folder / part)) for part in ("init", "goal"))
     return GoalSpec(name or str(folder), starts, goals)
@@ -89,7 +88,7 @@ def read_text(spec: str) -> GoalSpec:
     """Parse ``text:START -> GOAL``.
 
     Raises:
-        BadInput: there are not two sides.
+        BadInput: the text does not have two sides.
     """
     sides = [side.strip() for side in spec.removeprefix(TEXT).split("->")]
     if len(sides) != 2 or not all(sides):
@@ -99,12 +98,12 @@ def read_text(spec: str) -> GoalSpec:
 
 
 def goal_folder(spec: str, task: Task) -> Path | None:
-    """Return the folder with the pictures that a spec names; None for sentences and the scene itself.
+    """Return the folder of pictures that a spec names; None for sentences and the scene itself.
 
     Raises:
-        BadInput: there is no such folder, or the spec is none of the kinds.
+        BadInput: there is no such folder, or the spec is of no known kind.
     """
-    if spec in (SAME_SCENE, OWN_TEXT) or spec.startswith(TEXT):
+    if spec in (SAME_SCENE, TASK_TEXT) or spec.startswith(TEXT):
         return None
     if spec == DRAWINGS:
         return _drawings(task)
@@ -145,29 +144,29 @@ def read_goal(spec: str, task: Task, scene: tuple[NDArray[np.uint8], NDArray[np.
 
     Args:
         spec: see the module's docstring.
-        task: for specs that are different things for each task.
+        task: for specs that depend on the task.
         scene: (V, H, W, 3) start and goal frames of the scene itself, needed for ``same-scene``.
 
     Raises:
-        BadInput: the spec is none of the kinds, or what it names cannot be read.
+        BadInput: the spec is of no known kind, or cannot be read.
     """
     if spec == SAME_SCENE:
         if scene is None:
             raise BadInput(f"goal {SAME_SCENE!r} needs frames of the scene")
         return GoalSpec(spec, tuple(scene[0]), tuple(scene[1]), per_view=True)
-    if spec == OWN_TEXT:
+    if spec == TASK_TEXT:
         return GoalSpec(spec, (task.start_text,), (task.goal_text,))
     folder = goal_folder(spec, task)
     return read_text(spec) if folder is None else read_folder(folder, spec)
 
 
 def read_kitchen_goal(spec: str, views: Views, scene_qpos: NDArray[np.float64]) -> GoalSpec:
-    """Read a goal spec of a kitchen task, and render the scene where it is the goal.
+    """Read a goal spec of a kitchen task, and render the scene for a same-scene goal.
 
     Args:
-        spec: of any kind.
+        spec: see the module's docstring.
         views: of the task.
-        scene_qpos: (nq,) a start state.
+        scene_qpos: (nq,) a start state of the scene.
 
     Raises:
         BadInput: as `read_goal`.
@@ -181,12 +180,12 @@ def read_free_goal(spec: str) -> GoalSpec:
     """Read a goal spec that needs no task: a folder, or two sentences.
 
     Raises:
-        BadInput: the spec is one of those of the kitchen, or what it names cannot be read.
+        BadInput: the spec is for kitchen tasks only, or cannot be read.
     """
     if spec.startswith(TEXT):
         return read_text(spec)
     folder = Path(spec).expanduser()
-    if spec in (SAME_SCENE, DRAWINGS, OWN_TEXT) or spec.startswith(VISUAL_TASKS) or not folder.exists():
+    if spec in (SAME_SCENE, DRAWINGS, TASK_TEXT) or spec.startswith(VISUAL_TASKS) or not folder.exists():
         kitchen = f"{SAME_SCENE!r}, {DRAWINGS!r}, 'text' and '{VISUAL_TASKS}…' are of zest/Kitchen-v1's tasks alone"
         raise BadInput(
             f"frames from elsewhere need a goal of their own, got {spec!r} ({kitchen}); give --goal a folder with "

@@ -1,4 +1,4 @@
-"""Scores → a relabeled Minari dataset with provenance, under a name that is a hash of how it was scored."""
+"""Scores → a relabeled Minari dataset with provenance, named by a hash of how it was scored."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import numpy as np
 from PIL import Image
 
 from zest_rl.data import reader
-from zest_rl.data.provenance import RelabelRecord, ScorerRecord
+from zest_rl.data.provenance import RelabelRecord
 from zest_rl.data.writer import write_scored
 from zest_rl.embedders import DEFAULT_EMBEDDER, Precision
 from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.views import Views
 from zest_rl.rewards.embeddings import EpisodeEmbeddings
 from zest_rl.rewards.frame_embeddings import FrameEmbeddings
-from zest_rl.rewards.goals import GoalSpec, read_free_goal, read_kitchen_goal
+from zest_rl.rewards.goals import read_free_goal, read_kitchen_goal
 from zest_rl.rewards.scorer import SCORER_FILE, Scorer, ScorerConfig
 from zest_rl.rewards.scores import Features, Similarity
-from zest_rl.rewards.state_embeddings import EmbedConfig, StateEmbedder, StateEmbeddings
+from zest_rl.rewards.state_embeddings import StateEmbedder, StateEmbeddings
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.parallel import Engine
 from zest_rl.sources import KitchenStates, Source, open_source
@@ -31,12 +31,12 @@ from zest_rl.types import FloatArray
 Reward = Literal["level", "difference"]
 GOAL_FOLDER = "zest_goal"
 MAX_THUMBNAILS, THUMBNAIL = 8, 160
-"""Pictures per side of a goal that a report shows, and their largest side in pixels."""
+"""Number of start pictures and of goal pictures kept for reports, and their longer side in pixels."""
 
 
 @dataclass(frozen=True)
 class Relabeled:
-    """What `relabel` made or found."""
+    """Result of `relabel`: the new dataset, or the equal one that existed."""
 
     dataset_id: str
     path: Path
@@ -45,15 +45,15 @@ class Relabeled:
     n_frames: int
     """Scored frames of one view: T + 1 per episode."""
     n_embedded: int
-    """Of what the embeddings' unit says, those that were not in the cache."""
+    """Number of `unit` that were not in the cache."""
     unit: str
-    """``distinct_states``, or ``episodes``."""
+    """``distinct_states`` or ``episodes``."""
     n_still: int | None
-    """Frames without any change against their first frame; None when the dataset was there already."""
+    """Number of unchanged frames, equal to the first of their episode; None if the dataset existed."""
 
     @property
     def already_there(self) -> bool:
-        """Whether there was nothing to do."""
+        """Whether the dataset existed."""
         return self.n_still is None
 
 
@@ -75,16 +75,16 @@ def rewards_from_scores(scores: FloatArray, reward: Reward = "level") -> FloatAr
 
 
 def shuffled(scores: Sequence[FloatArray], seed: int) -> list[FloatArray]:
-    """Give every episode the scores of another one: rewards of the same shape that tell nothing.
+    """Give every episode the scores of another one: a null control, rewards that say nothing about their episode.
 
     Raises:
         BadInput: there are fewer than 2 episodes, or they are not equally long.
     """
     if len(scores) < 2 or len({len(score) for score in scores}) > 1:
         raise BadInput("scores can be shuffled among 2 or more equally long episodes only; leave --shuffle out")
-    order = np.random.default_rng(seed).permutation(len(scores))  # in a ring, so that none keeps its own
-    taken = dict(zip(order, np.roll(order, 1), strict=True))
-    return [scores[taken[i]] for i in range(len(scores))]
+    order = np.random.default_rng(seed).permutation(len(scores))  # a ring, so that none keeps its own
+    donors = dict(zip(order, np.roll(order, 1), strict=True))
+    return [scores[donors[i]] for i in range(len(scores))]
 
 
 def relabeled_id(source_id: str, digest: str) -> str:
@@ -108,10 +108,10 @@ def relabel(
     goal_share: float = 1.0,
     **options: Any,
 ) -> Relabeled:
-    """Write a copy of a dataset whose rewards are ZeST scores, by the arguments of `zest relabel`.
+    """Write a copy of a dataset whose rewards are ZeST scores, with the arguments of `zest relabel`.
 
-    `dataset` and `frames` … `tolerance` say what is seen (`open_source`), `goal` and `embedder` … `goal_share` how it
-    is scored (`ScorerConfig`); the other options and the errors are those of `relabel_source`.
+    `dataset` and `frames` … `tolerance` choose the frames (`open_source`), `goal` and `embedder` … `goal_share` the
+    scorer (`ScorerConfig`); the other options and the errors are those of `relabel_source`.
     """
     config = ScorerConfig(goal, embedder, features, similarity, precision, goal_share)
     source = open_source(
@@ -133,15 +133,15 @@ def relabel_source(
 ) -> Relabeled:
     """Write a copy of a dataset whose rewards are ZeST scores.
 
-    The ground truth stays in the infos, unread; rewards that the dataset came with otherwise are kept beside the new
-    ones, as ``infos/source/reward``.
+    The ground truth stays in the infos, unread; original rewards that are not ground truth are kept as
+    ``infos/source/reward``.
 
     Args:
         source: episodes and their frames.
         config: the scorer.
         reward: the level of the score at each step, or its change.
         shuffle: null control: give each episode the scores of another one, drawn with this seed.
-        device: where the embedder runs.
+        device: of the embedder.
         n_workers: processes that read or render, and embed; default one per core.
         engine: processes of this machine, or workers of a Ray cluster; the rewards are the same.
         on_progress: called with (parts embedded, parts in all).
@@ -162,18 +162,18 @@ def relabel_source(
         n_embedded = embeddings.n_embedded
         return Relabeled(target_id, path, source, scorer, n_frames, n_embedded, embeddings.unit, n_still)
 
-    def find() -> Relabeled:
-        """Return the dataset that is there already, and a scorer with the goals that it was scored by."""
-        with reader.open_dataset(target_id) as there:
-            made = there.record.relabel
-        kept = None if made is None else made.kept_goals
+    def existing() -> Relabeled:
+        """Return the dataset on disk, and a scorer with the goals that it kept."""
+        with reader.open_dataset(target_id) as ds:
+            record = ds.record.relabel
+        kept = None if record is None else record.kept_goals
         return result(scorer if kept is None else scorer.with_goals(np.array(kept)), None)
 
     if reader.exists(target_id):
-        return find()
+        return existing()
     with artifacts.lock(path):
         if reader.exists(target_id):  # an equal call that ran at the same time
-            return find()
+            return existing()
         embeddings.embed(on_progress)
         kept = scorer.goals_near(embeddings) if config.goal_share < 1 else None
         scorer = scorer if kept is None else scorer.with_goals(kept)
@@ -187,7 +187,7 @@ def relabel_source(
             reward=reward,
             shuffle=shuffle,
             kept_goals=None if kept is None else tuple(kept.tolist()),
-            scorer=ScorerRecord.from_json(scorer.describe()),
+            scorer=scorer.record,
             n_still_frames=n_still,
             provenance=artifacts.provenance(),
         )
@@ -198,7 +198,7 @@ def relabel_source(
             scores,
             description=f"Rewards are scores ({config.similarity}+{config.features}, {reward}) by {config.embedder}.",
             zest={"relabel": record.to_json()},
-            extra=lambda folder: _leave_scorer(folder, scorer),
+            extra=lambda folder: _write_scorer(folder, scorer),
         )
     return result(scorer, n_still)
 
@@ -208,26 +208,20 @@ def _open(
 ) -> tuple[Scorer, EpisodeEmbeddings]:
     """Build the scorer, and open the embeddings: of distinct states where frames are rendered from them."""
     frames = source.frames
+    options: dict[str, Any] = {"device": device, "n_workers": n_workers, "engine": engine}
     if not isinstance(frames, KitchenStates):
         scorer = Scorer.build(config, read_free_goal(config.goal), device=device)
-        options: dict[str, Any] = {"device": device, "n_workers": n_workers, "engine": engine}
         return scorer, FrameEmbeddings(source, config.embedder, config.precision, **options)
     goal = read_kitchen_goal(config.goal, frames.ring, frames.states[0][0])
-    embedder = StateEmbedder(
-        EmbedConfig(frames.ring, config.embedder, config.precision, device), n_workers=n_workers, engine=engine
-    )
+    embedder = StateEmbedder(frames.ring, config.embedder, config.precision, **options)
     return Scorer.build(config, goal, views=frames.ring, device=device), StateEmbeddings(embedder, frames.states)
 
 
-def _leave_scorer(folder: Path, scorer: Scorer) -> None:
-    """Leave the goal in a dataset's folder, and the scorer where it can score online."""
+def _write_scorer(folder: Path, scorer: Scorer) -> None:
+    """Save the scorer in a dataset's folder if it can score online, and thumbnails of the goal's pictures."""
     if scorer.views is not None:
         scorer.save(folder / SCORER_FILE)
-    _leave_goal(folder, scorer.goal)
-
-
-def _leave_goal(folder: Path, goal: GoalSpec | None) -> None:
-    """Leave small pictures of the goal, for reports, in a dataset's folder; nothing of sentences."""
+    goal = scorer.goal
     if goal is None or goal.is_text:
         return
     for part, pictures in (("init", goal.starts), ("goal", goal.goals)):

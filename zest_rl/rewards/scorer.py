@@ -1,7 +1,7 @@
-"""A goal and an embedder, joined into one object that scores embedded frames, wherever they come from.
+"""A scorer: a goal and an embedder, which score embedded frames of any origin.
 
-The same scorer relabels a dataset and scores a rollout online. It is saved beside what it made as a small safetensors
-file (the goal's embeddings) with its config, so that neither the goal pictures nor their folder are needed later.
+The same scorer relabels a dataset and scores a rollout online. It is saved beside the dataset as a small safetensors
+file (the goal's embeddings) with its config, so that the goal pictures are not needed later.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.data.provenance import ScorerRecord
 from zest_rl.embedders import Embedder, Precision
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen.views import Views
@@ -49,15 +50,11 @@ class ScorerConfig:
     similarity: Similarity = "cos"
     precision: Precision = "auto"
     goal_share: float = 1.0
-    """Share of the goals that are used: those that the episodes end nearest to (`Scorer.goals_near`)."""
+    """Share of the goals that are used: the nearest to the ends of the episodes (`Scorer.goals_near`)."""
 
     def __post_init__(self) -> None:
         check_names(self.features, self.similarity)
         check_goal_share(self.goal_share)
-
-    def load_embedder(self, device: str = "auto") -> Embedder:
-        """Return the embedder, shared within the process; the default's network is loaded at its first picture."""
-        return shared_embedder(self.embedder, self.precision, device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,14 +63,14 @@ class Scorer:
 
     config: ScorerConfig
     starts: FloatArray
-    """(S, D), or (V, S, D) for a goal that differs by view."""
+    """(S, D), or (V, S, D) for a goal per view."""
     goals: FloatArray
     """(K, D) or (V, K, D)."""
     goal_sha256: str
-    """Of the goal's content, before any choice among its pictures."""
+    """Hash of the goal's content, before any choice among its pictures."""
     embedder_sha256: str
     views: Views | None = None
-    """Of the kitchen, which the frames are rendered from; None: the frames are not ours to render."""
+    """Views of the kitchen from which frames are rendered; None for other frames, which cannot be rendered."""
     goal: GoalSpec | None = None
     """The goal itself; None when only its embeddings were loaded."""
 
@@ -82,9 +79,9 @@ class Scorer:
         """Embed the goal.
 
         Raises:
-            BadInput: the embedder does not read the goal's kind.
+            BadInput: the goal is a sentence and the embedder reads pictures only.
         """
-        embedder = config.load_embedder(device)
+        embedder = shared_embedder(config.embedder, config.precision, device)
         starts, goals = embed_goal_cached(goal, embedder)
         return cls(config, starts, goals, goal.fingerprint(), embedder.fingerprint, views, goal)
 
@@ -100,7 +97,7 @@ class Scorer:
         """Score whole episodes.
 
         Returns:
-            (T+1,) float32 scores per episode; and how many frames after the first had no change in any view.
+            (T+1,) float32 scores per episode; and the number of unchanged frames, equal to the first in every view.
         """
         scores, n_still = [], 0
         for episode in episodes:
@@ -112,24 +109,22 @@ class Scorer:
 
     def by_view(self, episode: EmbeddedEpisode) -> FloatArray:
         """Score one episode by each view alone: (V, T+1) float32."""
-        n_views = episode.embeddings.shape[1]
-        return np.stack([self._of_view(v).score_episode(_one_view(episode, v)) for v in range(n_views)])
-
-    def _of_view(self, view: int) -> Scorer:
-        if self.starts.ndim == 2:
-            return self
-        alone = slice(view, view + 1)
-        return replace(self, starts=self.starts[alone], goals=self.goals[alone])
+        scores = []
+        for v in range(episode.embeddings.shape[1]):
+            view = slice(v, v + 1)
+            scorer = self if self.starts.ndim == 2 else replace(self, starts=self.starts[view], goals=self.goals[view])
+            scores.append(scorer.score_episode(replace(episode, embeddings=episode.embeddings[:, view])))
+        return np.stack(scores)
 
     def goals_near(self, episodes: Iterable[EmbeddedEpisode]) -> NDArray[np.intp]:
-        """Return the share ``config.goal_share`` of the goals (at least one) that the episodes end nearest to.
+        """Choose the share ``config.goal_share`` of the goals (at least one) nearest to the ends of the episodes.
 
-        The rule needs no ground truth ("goal images with high similarity", Cui et al. §5.3): kept are the goals by
-        which the last frames of the episodes score highest on average. It takes the data to lead somewhere: on
-        behaviour without intention it picks what resembles its end.
+        The rule needs no ground truth ("goal images with high similarity", Cui et al. §5.3): it keeps the goals for
+        which the last frames of the episodes score highest on average. It assumes that episodes lead to the goal: on
+        aimless behaviour it picks whatever resembles their end.
 
         Returns:
-            Indices of the goals, in their order.
+            Indices of the goals, ascending.
         """
         n_goals = self.goals.shape[-2]
         alone = [self.with_goals(np.array([k])) for k in range(n_goals)]
@@ -140,21 +135,25 @@ class Scorer:
         return np.sort(np.argsort(-at_end, kind="stable")[:n_kept])
 
     def with_goals(self, kept: NDArray[np.intp]) -> Self:
-        """Return a scorer with the goals of these indices alone."""
+        """Return a scorer with only the goals of these indices."""
         goal = self.goal
         if goal is not None and not goal.per_view:
             goal = replace(goal, goals=tuple(goal.goals[k] for k in kept))
         return replace(self, goals=self.goals[..., kept, :], goal=goal)
 
-    def describe(self) -> dict[str, Any]:
-        """Config and content hashes, JSON-ready: what provenance records."""
-        views = {} if self.views is None else {"views": asdict(self.views)}
-        views_sha256 = {} if self.views is None else {"views_sha256": self.views.fingerprint()}
-        hashes = {"goal_sha256": self.goal_sha256, "embedder_sha256": self.embedder_sha256, **views_sha256}
-        return {"config": {**views, **asdict(self.config)}, **hashes}
+    @property
+    def record(self) -> ScorerRecord:
+        """Config and content hashes, for provenance."""
+        return ScorerRecord(
+            **asdict(self.config),
+            goal_sha256=self.goal_sha256,
+            embedder_sha256=self.embedder_sha256,
+            views=None if self.views is None else asdict(self.views),
+            views_sha256=None if self.views is None else self.views.fingerprint(),
+        )
 
     def fingerprint(self) -> str:
-        """Hash of all that a score depends on besides the frames; names of files and folders are left out."""
+        """Hash of everything that a score depends on besides the frames; names of files and folders do not matter."""
         config = self.config
         how = {"features": config.features, "similarity": config.similarity, "goal_share": config.goal_share}
         rule = [] if config.goal_share == 1 else ["by last frames"]
@@ -168,7 +167,7 @@ class Scorer:
         """Write the goal's embeddings and the config as one safetensors file."""
         from safetensors.numpy import save
 
-        header = {"scorer": json.dumps(self.describe())}
+        header = {"scorer": json.dumps(self.record.to_json())}
         arrays = {"starts": np.ascontiguousarray(self.starts), "goals": np.ascontiguousarray(self.goals)}
         artifacts.write_bytes(path, save(arrays, metadata=header))
 
@@ -177,8 +176,8 @@ class Scorer:
         """Read what `save` wrote.
 
         Raises:
-            ZestError: the file is missing or damaged, or the embedder or renderer here is not the one that was used
-                (its scores would not be comparable).
+            ZestError: the file is missing or damaged, or the embedder or renderer here differs from the one that was
+                used (scores would not be comparable).
         """
         from safetensors import SafetensorError, safe_open
 
@@ -191,9 +190,10 @@ class Scorer:
             config, goal_sha256 = ScorerConfig(**values), described["goal_sha256"]
         except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
             raise ZestError(f"the scorer {path} cannot be read ({error}); relabel the dataset again") from error
-        scorer = cls(config, starts, goals, goal_sha256, config.load_embedder(device).fingerprint, views)
-        here = scorer.describe()
-        changed = [key for key in ("embedder_sha256", "views_sha256") if here.get(key) != described.get(key)]
+        embedder = shared_embedder(config.embedder, config.precision, device)
+        scorer = cls(config, starts, goals, goal_sha256, embedder.fingerprint, views)
+        record = scorer.record
+        changed = [key for key in ("embedder_sha256", "views_sha256") if getattr(record, key) != described.get(key)]
         if changed:
             raise ZestError(
                 f"the scorer {path} was made with another {' and '.join(k.removesuffix('_sha256') for k in changed)} "
@@ -202,12 +202,8 @@ class Scorer:
         return scorer
 
 
-def _one_view(episode: EmbeddedEpisode, view: int) -> EmbeddedEpisode:
-    return replace(episode, embeddings=episode.embeddings[:, view : view + 1])
-
-
 def embed_goal_cached(goal: GoalSpec, embedder: Embedder) -> tuple[FloatArray, FloatArray]:
-    """Embed a goal's starts and goals, through a cache: see `embed_goal`.
+    """Embed a goal's starts and goals through a cache; see `embed_goal`.
 
     Raises:
         BadInput: the goal is a sentence and the embedder reads pictures only.

@@ -16,24 +16,24 @@ from zest_rl.types import FloatArray
 
 Doubles = NDArray[np.float64]
 Features = Literal["raw", "delta", "projection", "progress", "classifier"]
-"""Of the paper the first two; the others are rewards to compare with, which bring a similarity of their own."""
+"""The first two are the paper's; the others are rewards to compare with, each with a similarity of its own."""
 Similarity = Literal["cos", "l2"]
 PROJECTED = 0.5
-"""α of `score_projection`, unless it is called with another one."""
+"""Default α of `score_projection`."""
 LOGIT_SCALE = 100.0
-"""What CLIP multiplies its cosines by before a softmax."""
+"""Factor by which CLIP multiplies its cosines before a softmax."""
 NUMBERS = {"projection": PROJECTED, "classifier": LOGIT_SCALE}
-"""Features → the number that they depend on besides the embeddings."""
+"""Features → the constant that they depend on besides the embeddings."""
 
 ZERO_DELTA = 1e-6
-"""A change not longer than this times the embedding it starts from has no direction: its cosine is defined as 0."""
+"""A change whose norm is at most this times that of the first embedding has no direction: cosine 0 by definition."""
 
 
 def check_names(features: str, similarity: str) -> None:
-    """Refuse what is not there, and what does not go together.
+    """Check the names of features and similarity.
 
     Raises:
-        BadInput: an unknown name, or a similarity for features that bring one of their own.
+        BadInput: an unknown name, or another similarity for features that have their own.
     """
     if features not in get_args(Features):
         raise BadInput(f"unknown features {features!r}; {nearest(features, get_args(Features))}")
@@ -44,11 +44,7 @@ def check_names(features: str, similarity: str) -> None:
 
 
 def check_goal_share(share: float) -> None:
-    """Refuse a share of the goals that is not in (0, 1].
-
-    Raises:
-        BadInput: it is not.
-    """
+    """Check that a share of the goals is in (0, 1]; raises `BadInput`."""
     if not 0 < share <= 1:
         raise BadInput(f"goal_share must be in (0, 1], got {share}")
 
@@ -84,7 +80,7 @@ def _similarity(a: Doubles, b: Doubles, similarity: Similarity) -> Doubles:
 
 
 def _change(after: Doubles, before: Doubles) -> Doubles:
-    """`after` (N, D) − `before` (D,) or (N, D), with changes that have no direction (`ZERO_DELTA`) set to zero."""
+    """`after` (N, D) − `before` (D,) or (N, D); changes without a direction (`ZERO_DELTA`) are set to zero."""
     change = after - before
     still = np.linalg.norm(change, axis=1) <= ZERO_DELTA * np.linalg.norm(before, axis=-1)
     change[still] = 0.0
@@ -115,22 +111,17 @@ def score_raw(frame_embeddings: FloatArray, goal_embeddings: FloatArray, similar
     return _mean_over_goals(_similarity(frames, goals, similarity))
 
 
-def _pairs(starts: Doubles, goals: Doubles) -> NDArray[np.intp]:
-    return np.asarray(_cos(goals, starts).argmax(axis=1))
-
-
-def pair_starts(start_embeddings: FloatArray, goal_embeddings: FloatArray) -> NDArray[np.intp]:
+def pair_starts(starts: Doubles, goals: Doubles) -> NDArray[np.intp]:
     """For each goal the index of the start picture most similar to it, by cosine of raw embeddings (App. B).
 
     Args:
-        start_embeddings: (S, D).
-        goal_embeddings: (K, D).
+        starts: (S, D) embeddings.
+        goals: (K, D) embeddings.
 
     Returns:
         (K,) integer indices into the starts.
     """
-    goals = _check("goal_embeddings", goal_embeddings)
-    return _pairs(_check("start_embeddings", start_embeddings, goals.shape[1]), goals)
+    return np.asarray(_cos(goals, starts).argmax(axis=1))
 
 
 def score_delta(
@@ -156,8 +147,7 @@ def score_delta(
         BadInput: shapes do not fit, or a value is not finite.
     """
     frames, goals, starts = _checked(frame_embeddings, start_embeddings, goal_embeddings)
-    wanted = _change(goals, starts)
-    return _mean_over_goals(_similarity(_change(frames, frames[0]), wanted, similarity))
+    return _mean_over_goals(_similarity(_change(frames, frames[0]), _change(goals, starts), similarity))
 
 
 def _unit(rows: Doubles) -> Doubles:
@@ -168,11 +158,11 @@ def _unit(rows: Doubles) -> Doubles:
 def _checked(
     frame_embeddings: FloatArray, start_embeddings: FloatArray, goal_embeddings: FloatArray
 ) -> tuple[Doubles, Doubles, Doubles]:
-    """Return frames (T+1, D), goals (K, D), and for each goal the start that it is paired with (K, D)."""
+    """Return frames (T+1, D), goals (K, D), and the start paired with each goal (K, D)."""
     frames = _check("frame_embeddings", frame_embeddings)
     starts = _check("start_embeddings", start_embeddings, frames.shape[1])
     goals = _check("goal_embeddings", goal_embeddings, frames.shape[1])
-    return frames, goals, starts[_pairs(starts, goals)]
+    return frames, goals, starts[pair_starts(starts, goals)]
 
 
 def score_projection(
@@ -186,8 +176,8 @@ def score_projection(
     x and g are unit vectors, b the unit vector of the start that g is paired with, P the projection onto g − b.
     Rocamonde et al. 2023, https://arxiv.org/abs/2310.12921, with pictures or sentences alike.
 
-    Args, Returns, Raises: see `score_delta`; `alpha` must be in [0, 1], 0 is the plain distance to the goal, 1 sees
-    nothing but the way from start to goal; scores are at most 1.
+    Args, Returns, Raises: see `score_delta`; `alpha` must be in [0, 1]: 0 is the plain distance to the goal, 1 sees
+    only the direction from start to goal; scores are at most 1.
     """
     if not 0 <= alpha <= 1:
         raise BadInput(f"alpha must be in [0, 1], got {alpha}")
@@ -202,20 +192,19 @@ def score_projection(
     return _mean_over_goals(np.stack(similarities, axis=1))
 
 
-def _covered(distances: Doubles) -> FloatArray:
-    """Distances to the goal (T+1,), summed over goals and views → share of the first one that is covered (T+1,)."""
-    return np.asarray((distances[0] - distances) / (distances[0] if distances[0] > 0 else 1.0), dtype=np.float32)
-
-
-def score_progress(frame_embeddings: FloatArray, goal_embeddings: FloatArray) -> FloatArray:
-    """Share of the distance to the goal that is covered: 1 − Σ ‖x_t − g‖ / Σ ‖x_0 − g‖, sums over goals.
+def _progress(distances: Doubles) -> FloatArray:
+    """Share of the distance to the goal that is covered: 1 − Σ ‖x_t − g‖ / Σ ‖x_0 − g‖, sums over goals and views.
 
     The distance that VIP rewards (Ma et al. 2023, https://arxiv.org/abs/2210.00030), as a ratio so that embedders and
-    goals of other scales compare. `score_views` sums over views, too: one that hardly shows the goal hardly counts.
+    goals of different scales compare. Summed over views, so that a view that hardly shows the goal hardly counts.
 
-    Args, Returns, Raises: see `score_raw`; the first score is 0, 1 is the goal.
+    Args:
+        distances: (T+1,), summed or averaged over goals, summed over views.
+
+    Returns:
+        (T+1,) float32; the first is 0, 1 is the goal.
     """
-    return _covered(-score_raw(frame_embeddings, goal_embeddings, "l2").astype(np.float64))
+    return np.asarray((distances[0] - distances) / (distances[0] if distances[0] > 0 else 1.0), dtype=np.float32)
 
 
 def score_classifier(
@@ -233,7 +222,7 @@ def score_classifier(
 
 
 def zero_deltas(frame_embeddings: FloatArray) -> NDArray[np.bool_]:
-    """Which frames of an episode have no direction of change against x_0: (T+1, D) → (T+1,) bool."""
+    """Which frames of an episode are unchanged against x_0 (`ZERO_DELTA`): (T+1, D) → (T+1,) bool."""
     frames = _check("frame_embeddings", frame_embeddings)
     return np.asarray((_change(frames, frames[0]) == 0).all(axis=1))
 
@@ -283,4 +272,4 @@ def score_views(
             total -= score_raw(frames[:, view], goals, "l2")
         else:
             total += score_classifier(frames[:, view], starts, goals)
-    return _covered(total) if features == "progress" else np.asarray(total / n_views, dtype=np.float32)
+    return _progress(total) if features == "progress" else np.asarray(total / n_views, dtype=np.float32)

@@ -1,10 +1,10 @@
 """Simulator states → embeddings of all views, each distinct state rendered and embedded once, cached by content.
 
-The cache is a folder of shards ``keys (n, nq) float64, embeddings (n, V, D) float32``; its name hashes everything that
-an embedding depends on. Any process may add shards, each is written atomically, none is ever changed.
+The cache is a folder of shards ``keys (n, nq) float64, embeddings (n, V, D) float32``; its name is a hash of
+everything that an embedding depends on. Any process may add shards; each is written atomically and never changed.
 
-One state is one batch of V frames on one thread, so that an embedding is the same number whichever states were
-embedded beside it: networks are exact only up to about 1e-6 across batch sizes and thread counts.
+One state is one batch of V frames on one thread, so that its embedding does not depend on the states embedded with it:
+networks are exact only up to about 1e-6 across batch sizes and thread counts.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.embedders import Embedder, Precision
+from zest_rl.embedders import Precision
 from zest_rl.errors import ZestError
 from zest_rl.kitchen.views import Views, canonical_states, distinct_states
-from zest_rl.rewards.embeddings import EmbeddedEpisode, check_same_embedder, shared_embedder
+from zest_rl.rewards.embeddings import EmbeddedEpisode, WorkerEmbedder, shared_embedder
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_array, write_arrays
 from zest_rl.runtime.parallel import Engine, cached_jobs, chunks, one_thread
@@ -34,33 +34,16 @@ SHARDS_IN_MEMORY = 64
 
 
 @dataclass(frozen=True)
-class EmbedConfig:
-    """What turns a state into embeddings."""
-
-    views: Views
-    embedder: str
-    """Embedder URI, see `zest_rl.embedders`."""
-    precision: Precision = "auto"
-    device: str = "auto"
-
-    def load_embedder(self) -> Embedder:
-        """Return the embedder, shared within the process."""
-        return shared_embedder(self.embedder, self.precision, self.device)
-
-
-@dataclass(frozen=True)
 class _Job:
     """Some states to embed."""
 
-    config: EmbedConfig
+    views: Views
+    embedder: WorkerEmbedder
     states: NDArray[np.float64]
-    fingerprint: str
-    """Of the embedder."""
 
 
 def _embed_states(job: _Job) -> dict[str, NDArray[np.generic]]:
-    renderer, embedder = job.config.views.shared_renderer(), job.config.load_embedder()
-    check_same_embedder(embedder, job.fingerprint)
+    renderer, embedder = job.views.shared_renderer(), job.embedder.load()
     with one_thread():
         embeddings = [embedder.embed_images(list(renderer.render(state))) for state in job.states]
     return {"keys": job.states, "embeddings": np.stack(embeddings)}
@@ -75,60 +58,69 @@ def _read_shard(path: Path) -> FloatArray | None:
 class StateEmbedder:
     """Embeds simulator states through a cache on disk."""
 
-    def __init__(self, config: EmbedConfig, *, n_workers: int | None = None, engine: Engine = "local") -> None:
-        """Open the cache of `config` (created when something is first written)."""
-        self.config = config
+    def __init__(
+        self,
+        views: Views,
+        embedder: str,
+        precision: Precision = "auto",
+        *,
+        device: str = "auto",
+        n_workers: int | None = None,
+        engine: Engine = "local",
+    ) -> None:
+        """Open the cache (created when something is first written); arguments as in `FrameEmbeddings`."""
+        fingerprint = shared_embedder(embedder, precision, device).fingerprint
+        self.views, self.embedder = views, WorkerEmbedder(embedder, precision, device, fingerprint)
         self.n_workers, self.engine = n_workers, engine
-        self.embedder = config.load_embedder()
         self.n_embedded = 0
-        """States that were not in the cache and had to be rendered and embedded."""
-        digest = artifacts.hash_json([config.views.fingerprint(), self.embedder.fingerprint])
+        """States that were not in the cache."""
+        digest = artifacts.hash_json([views.fingerprint(), fingerprint])
         self.folder: Path = artifacts.cache_dir() / "embeddings" / digest[:20]
         self._where: dict[bytes, tuple[Path, int]] = {}
         """State → its shard, and the row in it."""
         self._new: dict[bytes, FloatArray] = {}
-        """What `embed_now` computed and no shard holds yet."""
+        """Results of `embed_now` that are not in a shard yet."""
         self._read: set[Path] = set()
-        self._find()
+        self._index_shards()
 
-    def _find(self) -> None:
-        """Learn which states the shards hold that came since; a damaged one is as good as none."""
+    def _index_shards(self) -> None:
+        """Index the states of new shards; a damaged shard is ignored."""
         for path in sorted(self.folder.glob("*.npz")):
             if path not in self._read and (keys := read_array(path, "keys")) is not None:
                 self._where.update((key, (path, row)) for row, key in enumerate(state_keys(keys)))
                 self._read.add(path)
 
     def embed(self, qpos: NDArray[np.float64], on_progress: Callable[[int, int], None] | None = None) -> None:
-        """Leave the embeddings of states in the cache, all cores at work on those that are not there.
+        """Embed the states that are not in the cache, on all cores.
 
         Args:
             qpos: (N, nq) simulator positions.
             on_progress: called with (shards done, shards in all).
         """
-        states = distinct_states(qpos, self.config.views)  # as the episodes meet them: an episode needs few shards
+        states = distinct_states(qpos, self.views)  # in the order of the episodes: an episode needs few shards
         missing = states[[key not in self._where for key in state_keys(states)]]
         if len(missing) == 0:
             return
         jobs = {}
         for chunk in chunks(len(missing), STATES_PER_SHARD):
             part = missing[chunk.start : chunk.stop]
-            jobs[artifacts.hash_arrays(part)[:20]] = _Job(self.config, part, self.embedder.fingerprint)
+            jobs[artifacts.hash_arrays(part)[:20]] = _Job(self.views, self.embedder, part)
         embedded = cached_jobs(
-            _embed_states, jobs, self.folder, n_workers=self.n_workers, engine=self.engine, device=self.config.device
+            _embed_states, jobs, self.folder, n_workers=self.n_workers, engine=self.engine, device=self.embedder.device
         )
         for n_done, _ in enumerate(embedded, start=1):
             if on_progress is not None:
                 on_progress(n_done, len(jobs))
         self.n_embedded += len(missing)
-        self._find()
+        self._index_shards()
 
     def embedded(self, qpos: NDArray[np.float64]) -> EmbeddedEpisode:
-        """Read what `embed` left of one episode, (T+1, nq) simulator positions; a few shards are in memory at a time.
+        """Read the embeddings of one episode, (T+1, nq) simulator positions; a few shards are in memory at a time.
 
         Raises:
             ZestError: a file of the cache is damaged.
         """
-        states, inverse = np.unique(canonical_states(qpos, self.config.views), axis=0, return_inverse=True)
+        states, inverse = np.unique(canonical_states(qpos, self.views), axis=0, return_inverse=True)
         rows = []
         for key in state_keys(states):
             if (row := self._row(key)) is None:
@@ -145,8 +137,7 @@ class StateEmbedder:
             return None
         path, row = self._where[key]
         if (embeddings := _read_shard(path)) is not None:
-            found: FloatArray = embeddings[row]
-            return found
+            return np.asarray(embeddings[row])
         path.unlink(missing_ok=True)
         _read_shard.cache_clear()
         self._read.discard(path)
@@ -155,25 +146,25 @@ class StateEmbedder:
 
     def embed_now(self, qpos: NDArray[np.float64]) -> FloatArray:
         """Embed states in this process, for use within a rollout: (N, nq) → (N, V, D). Call `flush` at the end."""
-        states = canonical_states(qpos, self.config.views)
+        states = canonical_states(qpos, self.views)
         rows = []
         for state, key in zip(states, state_keys(states), strict=True):
             if (row := self._row(key)) is None:
-                job = _Job(self.config, state[None], self.embedder.fingerprint)
+                job = _Job(self.views, self.embedder, state[None])
                 self._new[key] = row = np.asarray(_embed_states(job)["embeddings"][0], np.float32)
                 self.n_embedded += 1
             rows.append(row)
         return np.stack(rows)
 
     def flush(self) -> None:
-        """Leave what `embed_now` computed in the cache."""
+        """Write the results of `embed_now` to the cache."""
         keys, rows = list(self._new), list(self._new.values())
         for part in chunks(len(keys), STATES_PER_SHARD):
             states = np.stack([np.frombuffer(key) for key in keys[part.start : part.stop]])
             path = self.folder / f"{artifacts.hash_arrays(states)[:20]}.npz"
             write_arrays(path, {"keys": states, "embeddings": np.stack(rows[part.start : part.stop])})
         self._new.clear()
-        self._find()
+        self._index_shards()
 
 
 class StateEmbeddings:
@@ -191,15 +182,15 @@ class StateEmbeddings:
         return self._embedder.n_embedded
 
     def identity(self) -> list[Any]:
-        """Nothing: the states are part of the recorded episodes, the views of the scorer."""
+        """Empty: the states belong to the recorded episodes, and the views to the scorer."""
         return []
 
     def describe(self) -> dict[str, Any]:
-        """Nothing: the scorer tells the views."""
+        """Empty: the scorer's record holds the views."""
         return {}
 
     def embed(self, on_progress: Callable[[int, int], None] | None = None) -> None:
-        """Leave the embeddings of all states in the cache."""
+        """Embed the states that are not in the cache."""
         self._embedder.embed(np.concatenate(list(self._states)), on_progress)
 
     def __iter__(self) -> Iterator[EmbeddedEpisode]:

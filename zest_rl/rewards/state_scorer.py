@@ -1,4 +1,4 @@
-"""A scorer and the embedder of its views: scores of simulator states, recorded or as a rollout meets them."""
+"""A scorer with the embedder of its views: scores of simulator states, recorded or during a rollout."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from zest_rl.errors import ZestError
 from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.rewards.goals import read_kitchen_goal
 from zest_rl.rewards.scorer import Scorer, ScorerConfig
-from zest_rl.rewards.state_embeddings import EmbedConfig, StateEmbedder, StateEmbeddings
+from zest_rl.rewards.state_embeddings import StateEmbedder, StateEmbeddings
 from zest_rl.types import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class StateScorer:
-    """Scores states of the kitchen, each rendered and embedded once."""
+    """Scores states of the kitchen; each is rendered and embedded once."""
 
     scorer: Scorer
     embedder: StateEmbedder
@@ -30,14 +30,12 @@ class StateScorer:
         """Open the cache of a scorer's views; `options` as in `StateEmbedder`.
 
         Raises:
-            ZestError: the scorer is of frames that are not rendered here.
+            ZestError: the scorer's frames are not rendered from states.
         """
         if scorer.views is None:
             raise ZestError("the frames of this scorer are from elsewhere, so it cannot score states")
         config = scorer.config
-        return cls(
-            scorer, StateEmbedder(EmbedConfig(scorer.views, config.embedder, config.precision, device), **options)
-        )
+        return cls(scorer, StateEmbedder(scorer.views, config.embedder, config.precision, device=device, **options))
 
     @classmethod
     def build(
@@ -52,36 +50,31 @@ class StateScorer:
         """Read and embed the goal.
 
         Args:
-            config: what is scored how.
-            views: from where, and of which task.
+            config: of the scorer.
+            views: of the task.
             scene_qpos: (nq,) a start state of the scene, for same-scene goals.
-            device: where the embedder runs.
+            device: of the embedder.
             options: as in `StateEmbedder`.
 
         Raises:
-            BadInput: the goal cannot be read, or the embedder does not read its kind.
+            BadInput: the goal cannot be read, or is a sentence and the embedder reads pictures only.
         """
         goal = read_kitchen_goal(config.goal, views, scene_qpos)
         return cls.of(Scorer.build(config, goal, views=views, device=device), device=device, **options)
 
     @classmethod
     def load(cls, path: Path, *, device: str = "auto", **options: Any) -> Self:
-        """Read what `Scorer.save` wrote; raises as `Scorer.load` does."""
+        """Read the file of `Scorer.save`; raises as `Scorer.load`."""
         return cls.of(Scorer.load(path, device=device), device=device, **options)
 
     def seen_as(self, task: str) -> Self:
         """Return a scorer with the same goals that sees states from the views of another task."""
-        embedder = self.embedder
-        views = replace(embedder.config.views, task=task)
-        return type(self).of(
-            replace(self.scorer, views=views),
-            device=embedder.config.device,
-            n_workers=embedder.n_workers,
-            engine=embedder.engine,
-        )
+        cache = self.embedder
+        scorer = replace(self.scorer, views=replace(cache.views, task=task))
+        return self.of(scorer, device=cache.embedder.device, n_workers=cache.n_workers, engine=cache.engine)
 
     def with_goals(self, kept: NDArray[np.intp]) -> Self:
-        """Return a scorer with the goals of these indices alone; both share what is embedded."""
+        """Return a scorer with only the goals of these indices, and the same cache."""
         return replace(self, scorer=self.scorer.with_goals(kept))
 
     def embeddings(self, states: Sequence[NDArray[np.float64]]) -> StateEmbeddings:
@@ -100,7 +93,7 @@ class StateScorer:
         return self.scorer.by_view(episode)
 
     def score_now(self, first: NDArray[np.float64], current: NDArray[np.float64]) -> FloatArray:
-        """Score one state of each of N running episodes; `flush` leaves their embeddings in the cache.
+        """Score one state of each of N running episodes; `flush` writes their embeddings to the cache.
 
         Args:
             first: (N, nq) their first states.
@@ -110,9 +103,9 @@ class StateScorer:
             (N,) float32 scores.
         """
         scores = np.empty(len(current), dtype=np.float32)
-        _, group = np.unique(canonical_states(first, self.embedder.config.views), axis=0, return_inverse=True)
-        for same in range(group.max() + 1):  # mostly one group: the objects start alike
-            rows = np.flatnonzero(group.reshape(-1) == same)
+        _, group = np.unique(canonical_states(first, self.embedder.views), axis=0, return_inverse=True)
+        for g in range(group.max() + 1):  # mostly one group: the objects start alike
+            rows = np.flatnonzero(group.reshape(-1) == g)
             states = np.concatenate([first[rows[:1]], current[rows]])
             scores[rows] = self.scorer.score(self.embedder.embed_now(states))[1:]
         return scores
@@ -123,11 +116,11 @@ class StateScorer:
         current: NDArray[np.float64],
         on_progress: Callable[[int, int], None] | None = None,
     ) -> FloatArray:
-        """Score many states, each against a start of its own; all cores embed.
+        """Score many states, each against its own start, embedded on all cores.
 
         Args:
-            first: (N, nq) their x_0.
-            current: (N, nq).
+            first: (N, nq) start states, x_0 of each.
+            current: (N, nq) states.
             on_progress: called with (parts embedded, parts in all).
 
         Returns:
@@ -137,5 +130,5 @@ class StateScorer:
         return self.score_now(first, current)
 
     def flush(self) -> None:
-        """Leave what `score_now` embedded in the cache."""
+        """Write the embeddings of `score_now` to the cache."""
         self.embedder.flush()
