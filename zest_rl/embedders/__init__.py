@@ -8,16 +8,16 @@
 | `timm:NAME` | timm's hub |
 | `open_clip:MODEL@/path`, `open_clip:MODEL/TAG@/path`, and so on for the three above | a local checkpoint file |
 | `moco:/path` | a pre-training checkpoint of MoCo v1 or v2 (ResNet50) |
-| `transformers:/folder`, `transformers:NAME` | Hugging Face's CLIP, SigLIP, DINO: as `save_pretrained` leaves it |
+| `transformers:/folder`, `transformers:NAME` | Hugging Face's CLIP, SigLIP, DINO, in `save_pretrained`'s layout |
 | `NAME:REST` | a family that another package registers (entry point in the group `zest_rl.embedders`) |
 
 With `@/path` the name still chooses architecture, activation and preprocessing, so keep the TAG when the file holds a
 tag's weights. A checkpoint is a `.safetensors` file or one that `torch.load(weights_only=True)` reads, and it must fill
-every parameter (but a classification head, which is cut off): nothing here ever runs on random weights. Images go
+every parameter except the classification head, which is cut off: no embedder ever runs on random weights. Images go
 through each model's own preprocessing.
 
-Torch is imported when a network is needed, and not before: the default embedder tells its `fingerprint` and `dim`
-without it, so that work on cached embeddings starts at once.
+Torch is imported only when a network is needed: the default embedder knows its `fingerprint` and `dim` without it, so
+that work on cached embeddings starts at once.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Embedder(Protocol):
 
     @property
     def uri(self) -> str:
-        """What `load_embedder` was asked for."""
+        """The URI given to `load_embedder`."""
 
     @property
     def fingerprint(self) -> str:
@@ -78,7 +78,7 @@ class Embedder(Protocol):
 
         Raises:
             BadInput: this network reads no text.
-            ZestError: the network returned NaN or infinity, or its tokenizer cannot be had.
+            ZestError: the network returned NaN or infinity, or its tokenizer is not available.
         """
 
 
@@ -101,7 +101,7 @@ def load_embedder(
 
     Raises:
         BadInput: unknown family, model, tag or device; a checkpoint that cannot be read or does not fit the model.
-        ZestError: the weights are neither cached nor can they be fetched.
+        ZestError: the weights are not cached and cannot be fetched.
     """
     if precision not in get_args(Precision):
         raise BadInput(f"unknown precision {precision!r}; {nearest(precision, get_args(Precision))}")
@@ -187,13 +187,13 @@ def _check_device(device: str) -> None:
     import torch
 
     index = int(device.partition(":")[2] or 0)
-    there = torch.backends.mps.is_available() if device == "mps" else index < torch.cuda.device_count()
-    if not there:
+    available = torch.backends.mps.is_available() if device == "mps" else index < torch.cuda.device_count()
+    if not available:
         raise BadInput(f"torch finds no device {device!r} on this machine; use 'auto' or 'cpu'")
 
 
 def _computes_bf16(device: str) -> bool:
-    """Tell whether the hardware computes bf16 natively; without torch, for fingerprints must not wait for it."""
+    """Whether the hardware computes bf16 natively; without torch, since fingerprints must not wait for its import."""
     if device.startswith("cuda") or (device == "auto" and Path("/proc/driver/nvidia/gpus").is_dir()):
         return True
     cpu = Path("/proc/cpuinfo")
@@ -210,7 +210,7 @@ def _place(network: Network, device: str, bf16: bool) -> Network:
 
 
 def _fingerprint(uri: str, network: Network, bf16: bool) -> str:
-    """Hash the loaded weights, so that a copy of a checkpoint in another file or format gives the same."""
+    """Hash the loaded weights, so that the same checkpoint in another file or format has the same fingerprint."""
     state = network.module.state_dict()
     weights = [list(state), hash_arrays(*(value.numpy() for value in state.values()))]
     layout = [re.sub(r" at 0x[0-9a-f]+", "", repr(part)) for part in (network.module, network.preprocess)]

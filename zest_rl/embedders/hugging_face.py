@@ -29,17 +29,17 @@ class _Preprocess:
 
 
 def build(uri: str, source: str) -> Network:
-    """Return the image tower, and the text tower where there is one, of a model of any family that has them.
+    """Return the image tower of a model of any family, and its text tower where there is one.
 
     Vectors are `get_image_features` and `get_text_features` where the model has them (CLIP, SigLIP), else its pooled
-    output (DINOv2), or its class token where it has no pooling or the checkpoint has no weights for it (ViT, DINO).
+    output (DINOv2), else its class token: where it has no pooling, or the checkpoint no weights for it (ViT, DINO).
 
     Args:
         uri: for messages.
-        source: a folder with config, weights and processor; or a name on the hub.
+        source: a folder with config, weights and processor, or a name on the hub.
 
     Raises:
-        BadInput: the folder cannot be read, its weights are not all there, or the model reads no pictures.
+        BadInput: the folder cannot be read, weights are missing, or the model reads no pictures.
         ZestError: the hub does not answer.
     """
     from transformers import AutoImageProcessor, AutoModel, AutoTokenizer
@@ -62,7 +62,7 @@ def build(uri: str, source: str) -> Network:
         module, info, processor = checkpoints.fetch(uri, load)
     missing = sorted(info["missing_keys"])
     if missing and all(name.startswith("pooler.") for name in missing):
-        module.pooler, missing = None, []  # classifiers are published without it
+        module.pooler, missing = None, []  # classifiers are published without a pooler
     checkpoints.refuse_misfits(folder, type(module).__name__, missing, (), sorted(map(str, info["mismatched_keys"])))
     if processor.model_input_names != ["pixel_values"]:
         raise BadInput(
@@ -98,7 +98,7 @@ def build(uri: str, source: str) -> Network:
 
 
 def _vector(output: Any) -> torch.Tensor:
-    """Return what a model says of its whole input, (N, D), of whatever its version returns."""
+    """Return a model's vectors of whole inputs, (N, D), from whatever object its version returns."""
     if isinstance(output, torch.Tensor):
         return output
     pooled = getattr(output, "pooler_output", None)

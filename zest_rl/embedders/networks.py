@@ -1,4 +1,4 @@
-"""The families of networks: each builder returns a network with its weights, in fp32 on the CPU."""
+"""Families of networks: each builder returns a network with its weights, in fp32 on the CPU."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ _RESNETS = ("resnet18", "resnet34", "resnet50", "resnet101", "resnet152")
 
 
 def build(uri: str) -> Network:
-    """Return the network of any URI but the default's.
+    """Return the network of any URI except the default's.
 
     Raises:
         BadInput: unknown family, model or tag; a checkpoint that cannot be read or does not fit.
-        ZestError: the weights cannot be had, or a registered embedder fails.
+        ZestError: the weights are not available, or a registered embedder fails.
     """
     family, _, rest = uri.partition(":")
     if family == "moco":
@@ -55,7 +55,7 @@ def build(uri: str) -> Network:
 
 
 def _build_registered(uri: str, rest: str, entry: importlib.metadata.EntryPoint) -> Network:
-    """Return what a function of somebody else's package makes of the rest of the URI."""
+    """Call the function that another package registered, with the rest of the URI."""
     try:
         network = entry.load()(rest)
         if isinstance(network, Network):
@@ -79,10 +79,10 @@ def _build_registered(uri: str, rest: str, entry: importlib.metadata.EntryPoint)
 
 
 def build_lite0(weights: Path) -> Network:
-    """Fill timm's network in order: the file lists the same layers in the same order, under other names.
+    """Fill timm's network in order: the file lists the same layers in the same order, under different names.
 
     Raises:
-        ZestError: the file is laid out otherwise.
+        ZestError: the file has another layout.
     """
     state = torch.load(weights, map_location="cpu", weights_only=True)
     module = timm.create_model("tf_efficientnet_lite0", pretrained=False)
@@ -112,8 +112,8 @@ def _fold_batch_norms(module: nn.Module) -> None:
 def _pad_in_convolutions(module: nn.Module) -> None:
     """Give kernels a leading row and column of zeros instead of padding the picture unevenly.
 
-    TensorFlow pads one pixel more after than before, which torch's convolutions cannot, and timm copies every picture
-    into a larger one for it. With the zeros the padding is even: a third less time on a CPU, equal to the bit. All
+    TensorFlow pads one pixel more after than before, which torch's convolutions cannot do, so timm copies every picture
+    into a larger one. With the zeros the padding is even: a third less time on a CPU, equal to the bit. All
     convolutions here have stride 2 and see pictures of even size.
     """
     for parent in module.modules():

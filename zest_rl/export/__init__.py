@@ -1,9 +1,8 @@
-"""Datasets → what other offline-RL code reads, as files or, for d3rlpy and TorchRL, as their own objects.
+"""Datasets → the formats of other offline-RL code, as files or, for d3rlpy and TorchRL, as their own objects.
 
-Transition t of an episode is (o_t, a_t, r_t, o_{t+1}); nothing is shifted and nothing is lost. Ground truth and scores
-go along under names of their own, and are never the reward unless the dataset's rewards are them.
+`zest_rl.export.transitions` says what a transition is.
 
-- ``npz``: flat arrays (N, …) of all transitions, in the order of episodes, which `episode` tells apart.
+- ``npz``: flat arrays (N, …) of all transitions, in the order of the episodes, numbered in `episode`.
 - ``d4rl``: the same names at the root of an HDF5 file, as ``d4rl.qlearning_dataset(env, dataset=…)`` reads them; that
   function leaves out the last transition of every episode that a time limit ended.
 - ``robomimic``: ``data/demo_I`` per episode with ``obs/flat`` and ``next_obs/flat``, and masks ``train`` and ``valid``.
@@ -11,8 +10,8 @@ go along under names of their own, and are never the reward unless the dataset's
 - ``torchrl``: a folder for ``TensorDict.load_memmap``.
 - ``lerobot``: a folder, LeRobotDataset v3.0 without videos; ``lerobot-progress``: its side-car of scores alone.
 
-docs/interop.md has a recipe for each, and what of it is tested against which version. To read and to write, NumPy,
-h5py and filelock are enough (and pyarrow for LeRobot's), so this works in the environments that those libraries pin.
+docs/interop.md has a recipe for each, and the version that it is tested against. Exporting needs only NumPy, h5py and
+filelock (and pyarrow for LeRobot's), so it works in the environments that those libraries pin.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ Format = Literal["npz", "d4rl", "robomimic", "d3rlpy", "torchrl", "lerobot", "le
 
 @dataclass(frozen=True)
 class _Writer:
-    """How a format is written."""
+    """One format."""
 
     write: Callable[[Path, TransitionDataset], None]
     suffix: str
@@ -53,7 +52,7 @@ class _Writer:
     is_folder: bool = False
     """`write` fills an empty folder."""
     loses_last_step: str | None = None
-    """Who leaves out the last transition of an episode that a time limit ended; None: nobody."""
+    """Reader that leaves out the last transition of an episode ended by a time limit; None: no reader does."""
 
 
 WRITERS = {
@@ -69,16 +68,16 @@ WRITERS = {
 
 @dataclass(frozen=True)
 class Exported:
-    """What `export` wrote."""
+    """Result of `export`."""
 
     path: Path
     n_episodes: int
     n_transitions: int
     arrays: tuple[str, ...]
-    """Names of the arrays of `transitions` that went into it."""
+    """Names of the arrays of `transitions` in it."""
     n_bytes: int
     left_out: tuple[str, ...]
-    """Entries of the observations that are no numbers: pictures and text."""
+    """Entries of the observations that are not numbers: pictures and text."""
 
 
 def export(
@@ -90,19 +89,18 @@ def export(
     normalise: bool = False,
     fps: int | None = None,
 ) -> Exported:
-    """Write a dataset in another format, atomically; every file of it is read and hashed once.
+    """Write a dataset in another format, atomically.
 
     Args:
-        dataset_id: any dataset with numbers among its observations; of pictures alone for ``lerobot-progress``.
+        dataset_id: any dataset with numbers among its observations; for ``lerobot-progress`` pictures alone will do.
         to: the format.
         output: the file, or the folder, which must not exist; None: DATASET.FORMAT in the current folder.
         shape: the rewards as they are, their change, or the last one alone.
         normalise: shift and scale the rewards to [0, 1] over the dataset.
-        fps: steps per second, which LeRobot alone records; None: as the dataset was recorded, if that is known, else
-            the kitchen's.
+        fps: steps per second, for LeRobot only; None: those of the recording if known, else the kitchen's.
 
     Raises:
-        BadInput: no such dataset, an unknown format, there is a file already, or the format would lose the rewards.
+        BadInput: no such dataset, an unknown format, the output exists, or the format would lose the rewards.
         ZestError: the disk is full or read-only, or pyarrow is missing.
     """
     if to not in WRITERS:

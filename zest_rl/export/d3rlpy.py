@@ -1,8 +1,8 @@
 """d3rlpy's replay buffers: the HDF5 file that `ReplayBuffer.load` reads, or the buffer itself.
 
-An episode there has as many observations as actions, so the last observation is left out, and d3rlpy's Q-learning takes
-the last step of an episode for a transition only when it is terminal. Its own loader of Minari datasets is not to be
-used: d3rlpy 2.8.1's `get_minari` shifts episode i by i observations.
+A d3rlpy episode has as many observations as actions, so the last observation is left out, and d3rlpy's Q-learning
+uses the last step of an episode only if it is terminal. Do not use d3rlpy's own loader of Minari datasets: `get_minari`
+of 2.8.1 shifts episode i by i observations.
 
 Layout: d3rlpy 2.8.1, `d3rlpy/dataset/io.py`, `dump` and `load`, DATASET_VERSION 2.1.
 """
@@ -27,10 +27,10 @@ VERSION = "2.1"
 def fields(episode: Transitions) -> dict[str, object]:
     """The fields of d3rlpy's `Episode`: observations (T, obs_dim), actions, rewards (T, 1), terminated.
 
-    Actions are (T, act_dim) float32 or, of a Discrete space, (T, 1) int64, from which d3rlpy tells the kind of space.
+    Actions are (T, act_dim) float32 or, for a Discrete space, (T, 1) int64; d3rlpy infers the space from the dtype.
 
     Raises:
-        BadInput: several whole numbers per action, which d3rlpy would take for one.
+        BadInput: several whole numbers per action, which d3rlpy would read as one.
     """
     actions = episode["actions"].reshape(len(episode["actions"]), -1)
     if actions.dtype.kind == "i" and actions.shape[1] > 1:
@@ -46,7 +46,7 @@ def fields(episode: Transitions) -> dict[str, object]:
 
 
 def write(path: Path, data: TransitionDataset) -> None:
-    """Write `NAME_I` of every episode; what is not in ``columns``, such as ``zest_score_I``, d3rlpy passes over."""
+    """Write `NAME_I` of every episode; d3rlpy ignores names that are not in ``columns``, such as ``zest_score_I``."""
     with h5py.File(path, "w") as file:
         file["columns"] = list(fields(data.episodes[0]))
         file["num_episodes"] = len(data.episodes)

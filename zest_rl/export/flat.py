@@ -12,7 +12,7 @@ from zest_rl.export.transitions import TransitionDataset
 
 
 def write_npz(path: Path, data: TransitionDataset) -> None:
-    """Write the arrays by the names of `transitions`, and ``about`` as JSON."""
+    """Write the arrays of `transitions` under the same names, and ``about`` as JSON."""
     with path.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, about=np.array(json.dumps(data.about)), **data.flat)
 

@@ -1,11 +1,11 @@
 """LeRobot's dataset folder of format v3.0, without videos, and its side-car of progress per frame.
 
-Frame t of an episode of T actions holds o_t, a_t and, under ``next.``, what follows: r_t, o_{t+1}, the ends, the ZeST
-score and the ground truth. o_t stands there twice, as ``observation.state`` and ``observation.environment_state``:
-LeRobot's policies refuse to train without either a camera or the latter. ``next.done`` marks the last frame whatever
-ended the episode, as LeRobot's recordings have it; ``next.truncated`` those that a time limit ended.
+Frame t of an episode of T actions holds o_t, a_t and, under ``next.``, r_t, o_{t+1}, the ends, the ZeST score and the
+ground truth. o_t is stored twice, as ``observation.state`` and ``observation.environment_state``: LeRobot's policies
+refuse to train without either a camera or the latter. ``next.done`` marks the last frame of every episode, as in
+LeRobot's recordings; ``next.truncated`` those that a time limit ended.
 
-The side-car ``sarm_progress.parquet`` is what LeRobot's reward-aligned behaviour cloning weighs frames by
+The side-car ``sarm_progress.parquet`` holds the frame weights of LeRobot's reward-aligned behaviour cloning
 (``--sample_weighting.type rabc``): ``progress_sparse`` of frame t is the ZeST score of o_t, scaled to [0, 1] over the
 dataset.
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 FPS = 12
-"""Of the kitchen: 12.5 steps a second, which Gymnasium's ``render_fps`` and LeRobot want as a whole number."""
+"""Of the kitchen: 12.5 steps per second, as the integer that Gymnasium's ``render_fps`` and LeRobot require."""
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_FILE, DATA_FILE = "meta/episodes/chunk-000/file-000.parquet", "data/chunk-000/file-000.parquet"
 TASKS_FILE, PROGRESS_FILE = "meta/tasks.parquet", "sarm_progress.parquet"
@@ -42,9 +42,7 @@ Columns = dict[str, NDArray[Any]]
 
 
 def write(folder: Path, data: TransitionDataset, fps: int | None = None) -> None:
-    """Write a dataset, with the side-car when there are scores.
-
-    Without `fps` the steps per second are those that the dataset was recorded with, if it says so, else the kitchen's.
+    """Write a dataset, with the side-car if there are scores; `fps` as in `zest_rl.export.export`.
 
     Raises:
         BadInput: `fps` is below 1, or actions are whole numbers.
@@ -92,7 +90,7 @@ def write(folder: Path, data: TransitionDataset, fps: int | None = None) -> None
 
 
 def write_progress(path: Path, data: TransitionDataset) -> None:
-    """Write the side-car alone: index, episode_index, frame_index, progress_sparse, and zest_score as it is.
+    """Write only the side-car: index, episode_index, frame_index, progress_sparse, and the unscaled zest_score.
 
     Raises:
         ZestError: pyarrow is not installed.
@@ -143,7 +141,7 @@ def _columns(flat: Transitions, starts: NDArray[Any], fps: int) -> Columns:
 
 
 def _task(record: DatasetRecord) -> str:
-    """The task in words, as policies that read language are told it."""
+    """The task in words, for policies that read language."""
     task = TASKS.get(record.env.get("kwargs", {}).get("task"))
     return task.goal_text if task else str(record.env.get("id") or record.id)
 
@@ -153,11 +151,11 @@ def _width(values: NDArray[Any]) -> int:
 
 
 def _stats(values: NDArray[Any]) -> dict[str, list[Any]]:
-    """Statistics per dimension, over exact quantiles (LeRobot's own are of histograms)."""
-    each = values.reshape(len(values), -1).astype(np.float64)
-    stats = {"min": each.min(0), "max": each.max(0), "mean": each.mean(0), "std": each.std(0)}
-    stats |= {name: np.quantile(each, share, axis=0) for name, share in QUANTILES.items()}
-    return {name: list(map(float, numbers)) for name, numbers in stats.items()} | {"count": [len(each)]}
+    """Statistics per dimension, with exact quantiles (LeRobot's own come from histograms)."""
+    rows = values.reshape(len(values), -1).astype(np.float64)
+    stats = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
+    stats |= {name: np.quantile(rows, share, axis=0) for name, share in QUANTILES.items()}
+    return {name: list(map(float, numbers)) for name, numbers in stats.items()} | {"count": [len(rows)]}
 
 
 def _pyarrow() -> Any:
@@ -170,7 +168,7 @@ def _pyarrow() -> Any:
 
 
 def _table(columns: Columns) -> pa.Table:
-    """Vectors become lists of fixed size, and vectors of one number plain numbers, as LeRobot has them."""
+    """Vectors as lists of fixed size, and vectors of one number as plain numbers, as in LeRobot's files."""
     arrow = _pyarrow()
     arrays = {}
     for name, values in columns.items():
@@ -188,16 +186,16 @@ def _episodes(columns: Columns, rows: list[slice], task: str) -> pa.Table:
         "dataset_from_index": [row.start for row in rows],
         "dataset_to_index": [row.stop for row in rows],
     }
-    for place in ("data/chunk_index", "data/file_index", "meta/episodes/chunk_index", "meta/episodes/file_index"):
-        table[place] = [0] * len(rows)
+    for key in ("data/chunk_index", "data/file_index", "meta/episodes/chunk_index", "meta/episodes/file_index"):
+        table[key] = [0] * len(rows)
     for name, values in columns.items():
-        each = [_stats(values[row]) for row in rows]
-        table |= {f"stats/{name}/{which}": [stats[which] for stats in each] for which in each[0]}
+        by_episode = [_stats(values[row]) for row in rows]
+        table |= {f"stats/{name}/{key}": [stats[key] for stats in by_episode] for key in by_episode[0]}
     return _pyarrow().table(table)
 
 
 def _tasks(task: str) -> pa.Table:
-    """One row; pandas, by which LeRobot reads it, is told that the task is the index."""
+    """One row, with metadata that make the task the index in pandas, with which LeRobot reads it."""
     columns = [
         {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}
         for name, kind, numpy_type in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
@@ -208,7 +206,7 @@ def _tasks(task: str) -> pa.Table:
 
 
 def _write_parquet(path: Path, table: pa.Table, rows: list[slice] | None = None) -> None:
-    """One row group, or one for each of `rows`, so that an episode can be read alone."""
+    """Write one row group, or one for each of `rows` so that an episode can be read alone."""
     with _pyarrow().parquet.ParquetWriter(path, table.schema) as writer:
         for row in rows or [slice(0, len(table))]:
             writer.write_table(table.slice(row.start, row.stop - row.start))

@@ -1,4 +1,4 @@
-"""robomimic's HDF5: one group per demonstration, and masks of those to train and to validate on."""
+"""robomimic's HDF5: one group per demonstration, and masks for training and validation."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ VALID_SHARE = 0.1
 
 
 def write(path: Path, data: TransitionDataset) -> None:
-    """Write ``data/demo_I`` with ``obs/flat`` and ``next_obs/flat``; ``dones`` are terminals and timeouts alike.
+    """Write ``data/demo_I`` with ``obs/flat`` and ``next_obs/flat``; ``dones`` includes timeouts.
 
-    One episode alone is in the mask ``train``, and ``valid`` is empty, which robomimic's SequenceDataset takes.
+    A single episode is in the mask ``train``, and ``valid`` is empty, which robomimic's SequenceDataset accepts.
 
     Raises:
         BadInput: actions are whole numbers.
@@ -43,6 +43,6 @@ def write(path: Path, data: TransitionDataset) -> None:
         group.attrs["env_args"] = json.dumps(env)
         group.attrs["about"] = json.dumps(data.about)
         n_valid = max(1, round(VALID_SHARE * len(names))) if len(names) > 1 else 0
-        chosen = set(np.random.default_rng(0).permutation(len(names))[:n_valid].tolist())
-        for mask, members in (("valid", chosen), ("train", set(range(len(names))) - chosen)):
+        valid = set(np.random.default_rng(0).permutation(len(names))[:n_valid].tolist())
+        for mask, members in (("valid", valid), ("train", set(range(len(names))) - valid)):
             file.create_dataset(f"mask/{mask}", data=np.array([names[i].encode() for i in sorted(members)], dtype="S"))

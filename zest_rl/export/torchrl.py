@@ -5,7 +5,7 @@ Keys as in TorchRL's own offline datasets::
     observation (N, obs_dim)   action (N, act_dim)   episode (N,)   gt_episode_success (N, 1)
     next: observation (N, obs_dim)   reward, done, terminated, truncated, zest_score, gt_reward (N, 1)
 
-TorchRL's own loader of Minari datasets is not to be used: `MinariExperienceReplay` of 0.14.1 returns zeros.
+Do not use TorchRL's own loader of Minari datasets: `MinariExperienceReplay` of 0.14.1 returns zeros.
 
 Layout of the folder: tensordict 0.14.3, `tensordict/_td_memmap.py`, `_save_metadata` and `_update_metadata`.
 """
@@ -55,8 +55,8 @@ def write(folder: Path, data: TransitionDataset) -> None:
     artifacts.write_json(folder / "about.json", data.about)
 
 
-def _write_level(folder: Path, arrays: dict[str, NDArray[Any]], below: dict[str, Any]) -> None:
-    meta: dict[str, Any] = dict(below)
+def _write_level(folder: Path, arrays: dict[str, NDArray[Any]], children: dict[str, Any]) -> None:
+    meta: dict[str, Any] = dict(children)
     for name, values in arrays.items():
         values.tofile(folder / f"{name}.memmap")
         dtype = f"torch.{values.dtype.name}"

@@ -1,7 +1,7 @@
-"""Datasets → transitions, which every format is written from.
+"""Datasets → transitions, the input of every format.
 
 Transition t of an episode is (o_t, a_t, r_t, o_{t+1}); nothing is shifted and nothing is lost. Ground truth and scores
-go along under names of their own, and are never the reward unless the dataset's rewards are them.
+have their own names; they are the reward only where they are the dataset's rewards.
 """
 
 from __future__ import annotations
@@ -25,35 +25,35 @@ Shape = Literal["step", "difference", "terminal"]
 Transitions = dict[str, NDArray[Any]]
 """Equally long arrays of one episode, see `transitions`."""
 SUCCESS = (SOURCE_SUCCESS, "infos/success", "infos/is_success")
-"""Where datasets of other robots hold success by step: LeRobot's once relabeled; Adroit's and mazes'; Fetch's."""
+"""Success by step in datasets of other robots: relabeled LeRobot's; Adroit's and mazes'; Fetch's."""
 
 
 @dataclass(frozen=True)
 class TransitionDataset:
-    """All that a file of any format may hold."""
+    """Everything that a file of any format may hold."""
 
     record: DatasetRecord
     """Of the dataset that was read."""
     episodes: list[Transitions]
     scores: list[FloatArray] | None
-    """(T+1,) each: ZeST scores of all frames, the first one too; None when the dataset was not relabeled."""
+    """(T+1,) each: ZeST scores of all frames, including the first; None if the dataset was not relabeled."""
     left_out: tuple[str, ...]
-    """Entries of the observations that are no numbers: pictures and text."""
+    """Entries of the observations that are not numbers: pictures and text."""
     about: dict[str, Any]
-    """JSON-ready: what a reader may want to know of where the file comes from, and what of it is left out."""
+    """JSON-ready: where the data come from, and what is left out."""
 
     def __len__(self) -> int:
         return sum(len(next(iter(episode.values()))) for episode in self.episodes)
 
     @property
     def flat(self) -> Transitions:
-        """The transitions of all episodes in one, and `episode` (N,) int64, which tells them apart."""
+        """The concatenated transitions of all episodes, and `episode` (N,) int64, the index of each one's episode."""
         arrays = {name: np.concatenate([episode[name] for episode in self.episodes]) for name in self.episodes[0]}
         lengths = [len(episode["rewards"]) for episode in self.episodes]
         return {**arrays, "episode": np.repeat(np.arange(len(lengths)), lengths)}
 
     def check_continuous(self, library: str) -> None:
-        """Raise `BadInput` where the actions are whole numbers, which `library` has no policies for."""
+        """Raise `BadInput` if the actions are whole numbers, for which `library` has no policies."""
         if self.episodes[0]["actions"].dtype.kind == "i":
             raise BadInput(
                 f"{library} takes continuous actions, got whole numbers; export to npz, d4rl, d3rlpy or torchrl"
@@ -67,15 +67,15 @@ def shape_rewards(
 
     Args:
         episodes: (T,) float32 each.
-        before: what the frame before the first action is worth, which the first difference is against.
+        before: the value of each episode's first frame, for the first difference.
         shape: see `Shape`.
-        normalise: shift and scale to [0, 1] over the dataset, after the shape was made; of ``terminal`` the last ones.
+        normalise: shift and scale the shaped rewards to [0, 1] over the dataset; with ``terminal`` only the last ones.
 
     Returns:
         (T,) float32 each.
 
     Raises:
-        BadInput: an unknown shape, or rewards that are all equal are to be normalised.
+        BadInput: an unknown shape, or `normalise` with rewards that are all equal.
     """
     if shape not in get_args(Shape):
         raise BadInput(f"unknown shape of rewards {shape!r}; {nearest(shape, get_args(Shape))}")
@@ -107,20 +107,20 @@ def transitions(dataset_id: str, *, shape: Shape = "step", normalise: bool = Fal
     Returns:
         observations, next_observations (T, obs_dim), actions (T, act_dim), rewards (T,) float32; terminals, timeouts
         (T,) bool; and where they are recorded, zest_score, gt_reward (T,) float32 after the action,
-        gt_episode_success (T,) bool, of the whole episode, and source_reward (T,) float32 and success (T,) bool after
-        the action, which another robot's dataset came with. A Dict of observations is flattened
-        (`zest_rl.data.observations.numbers`), and so are actions of several dimensions; whole numbers among the actions
-        are int64, (T,) those of a Discrete space.
+        gt_episode_success (T,) bool, of the whole episode, and for other robots their original source_reward (T,)
+        float32 and success (T,) bool after the action. A Dict of observations is flattened
+        (`zest_rl.data.observations.numbers`), and so are actions of several dimensions; actions that are whole numbers
+        are int64, of a Discrete space (T,).
 
     Raises:
-        BadInput: no such dataset, the rewards cannot be normalised, or are differences already.
+        BadInput: no such dataset, the rewards cannot be normalised, or are already differences.
     """
     with open_dataset(dataset_id) as ds:
         return read_transitions(ds, shape, normalise).episodes
 
 
 def read_transitions(ds: Dataset, shape: Shape = "step", normalise: bool = False) -> TransitionDataset:
-    """Read all that goes into a file of a dataset; arguments and errors as in `transitions`."""
+    """Read everything that a file may hold of a dataset; arguments and errors as in `transitions`."""
     episodes = ds.episodes(discrete=True)
     groups = list(ds.groups.values())
     columns: dict[str, list[NDArray[Any]]] = {}
@@ -180,7 +180,7 @@ def read_transitions(ds: Dataset, shape: Shape = "step", normalise: bool = False
 
 
 def read_progress(ds: Dataset) -> TransitionDataset:
-    """Read the scores alone, of a dataset that may hold pictures alone.
+    """Read only the scores; the observations may be pictures alone.
 
     Raises:
         BadInput: the dataset was not relabeled.
@@ -192,14 +192,14 @@ def read_progress(ds: Dataset) -> TransitionDataset:
 
 
 def _as_stored(actions: FloatArray, episode: h5py.Group) -> NDArray[Any]:
-    """Give actions (T, act_dim) the type that `episode` has them in and, of a Discrete space, their shape (T,)."""
+    """Restore the dtype that actions (T, act_dim) have in `episode` and, for a Discrete space, their shape (T,)."""
     if not acts_discretely(episode):
         return actions
     return (actions[:, 0] if episode["actions"].ndim == 1 else actions).astype(np.int64)
 
 
 def _success(episode: h5py.Group) -> NDArray[np.bool_] | None:
-    """Read whether the task was done after each action: (T,); None where that is not recorded."""
+    """Read success after each action: (T,); None where it is not recorded."""
     path = next((path for path in SUCCESS if path in episode), None)
     n_steps = len(episode["actions"])
     if path is None or len(episode[path]) not in (n_steps, n_steps + 1):
