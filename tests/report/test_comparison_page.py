@@ -21,10 +21,10 @@ from zest_rl.evaluation.evaluate import EvaluationConfig, evaluate
 from zest_rl.kitchen.videos import Video
 from zest_rl.metrics import statistics
 from zest_rl.report.comparison_page import compare, dataset_row, learning_curve, method_row, return_curve
-from zest_rl.report.episodes import paired_panels
+from zest_rl.report.episodes import paired_episodes
 from zest_rl.report.goals import goal_panel, goal_scatter
 from zest_rl.report.methods import Method, latest_evaluation, methods_of_runs
-from zest_rl.report.sections import Caveats, Details, Episodes, Goals, LearningCurves, Results
+from zest_rl.report.sections import CAVEATS, DETAILS, EPISODES, GOALS, LEARNING_CURVES, RESULTS
 
 CONFIG = EvaluationConfig(n_episodes=2, seed=11, rtg="constant")
 
@@ -55,16 +55,16 @@ def scored_dataset(runs: Path) -> str:
 def test_a_report_compares_methods_with_the_dataset_and_shows_goal_episodes_and_losses(evaluated: Path) -> None:
     methods = methods_of_runs([evaluated / name for name in ("bc-0", "bc-1", "dt-0")])
     report = compare("T", methods, source_id=COLLECTED, goals={"scene": scored_dataset(evaluated)}, caveats=["small"])
-    assert [(row.method, row.kind, row.n_seeds, row.n_episodes) for row in report.items(Results)] == [
+    assert [(row.method, row.kind, row.n_seeds, row.n_episodes) for row in report.items(RESULTS)] == [
         ("Demo", "dataset", 1, 4),
         ("BC", "method", 2, 4),
         ("DT on same-scene", "method", 1, 2),
     ]
-    single, paired = report.items(Episodes)[:6], report.items(Episodes)[6:]
+    single, paired = report.items(EPISODES)[:6], report.items(EPISODES)[6:]
     assert [panel.title for panel in single] == [
         f"{method}: {which}" for method in ("BC", "DT on same-scene") for which in ("best", "median", "worst")
     ]
-    assert all(panel.video.stat().st_size > 0 for panel in report.items(Episodes))
+    assert all(panel.video.stat().st_size > 0 for panel in report.items(EPISODES))
     assert all(panel.scores is not None and len(panel.scores) == len(panel.gt_progress) for panel in single)
     clone, other = (latest_evaluation(evaluated / name) for name in ("bc-0", "dt-0"))
     gains = other.normalized() - clone.normalized()
@@ -75,15 +75,15 @@ def test_a_report_compares_methods_with_the_dataset_and_shows_goal_episodes_and_
         np.testing.assert_array_equal(panel.gt_progress, other.traces["gt_reward"][index])
         assert panel.beside is not None
         np.testing.assert_array_equal(panel.beside[1], clone.traces["gt_reward"][index])
-    assert [goal.name for goal in report.items(Goals)] == ["scene"]
-    curves = report.items(LearningCurves)
+    assert [goal.name for goal in report.items(GOALS)] == ["scene"]
+    curves = report.items(LEARNING_CURVES)
     assert [curve.name for curve in curves] == ["BC", "DT on same-scene"]
     assert curves[0].low is not None, "two seeds have a range"
     assert curves[1].low is None
-    assert report.items(Caveats) == ("small",)
-    best = max(report.items(Results)[1:], key=lambda row: row.mean)
+    assert report.items(CAVEATS) == ("small",)
+    best = max(report.items(RESULTS)[1:], key=lambda row: row.mean)
     assert report.summary.startswith(f"{best.method} reaches {best.mean:.1f} % of the expert's return")
-    assert {"run bc-0", "run bc-1", "run dt-0"} <= dict(report.items(Details)).keys()
+    assert {"run bc-0", "run bc-1", "run dt-0"} <= dict(report.items(DETAILS)).keys()
 
 
 def test_a_row_sums_up_the_episodes_of_all_its_seeds(evaluated: Path) -> None:
@@ -127,10 +127,10 @@ def test_policies_are_shown_side_by_side_only_on_equal_starts(evaluated: Path) -
         videos.append(video)
         return video.path
 
-    assert [panel.video for panel in paired_panels(("BC", clone), ("DT", other), film)] == [v.path for v in videos]
+    assert [panel.video for panel in paired_episodes(("BC", clone), ("DT", other), film)] == [v.path for v in videos]
     assert len(videos) == 3
     assert all(video.beside is not None for video in videos)
-    assert paired_panels(("BC", clone), ("DT", elsewhere), film) == []
+    assert paired_episodes(("BC", clone), ("DT", elsewhere), film) == []
 
 
 def test_a_return_curve_holds_the_snapshots_that_were_evaluated_in_every_run(trained: Path) -> None:
@@ -162,8 +162,8 @@ def test_a_return_curve_holds_the_snapshots_that_were_evaluated_in_every_run(tra
         np.testing.assert_allclose(curve.low, [min(means) - fall, min(means)], rtol=1e-5, atol=1e-4)
     snapshot = runs[0] / "snapshots" / "update-000000001"
     report = compare("one policy on the way", methods_of_runs([snapshot]), source_id=None, goals={})
-    assert [row.n_episodes for row in report.items(Results)] == [2]
-    assert report.items(LearningCurves) == (), "a snapshot has no log of its own"
+    assert [row.n_episodes for row in report.items(RESULTS)] == [2]
+    assert report.items(LEARNING_CURVES) == (), "a snapshot has no log of its own"
 
 
 def test_too_few_episodes_to_rank_are_no_failure(trained: Path) -> None:
@@ -221,7 +221,7 @@ def test_the_newest_evaluation_is_shown_unless_one_is_asked_for(evaluated: Path)
     evaluate(evaluated / "bc-0", newer, n_workers=1)
     assert latest_evaluation(evaluated / "bc-0").config == newer
     methods = [Method("BC", (evaluated / "bc-0",), "control", evaluation=which) for which in (None, CONFIG, newer)]
-    rows = [compare("T", [method], source_id=None, goals={}).items(Results)[0] for method in methods]
+    rows = [compare("T", [method], source_id=None, goals={}).items(RESULTS)[0] for method in methods]
     assert [row.n_episodes for row in rows] == [3, 2, 3]
 
 
@@ -229,7 +229,7 @@ def test_a_report_says_when_methods_did_not_meet_the_same_starts(evaluated: Path
     evaluate(evaluated / "bc-0", replace(CONFIG, n_episodes=3), n_workers=1)
     methods = [Method("BC", (evaluated / "bc-0",), "control"), Method("DT", (evaluated / "dt-0",), "control")]
     report = compare("T", methods, source_id=None, goals={}, caveats=["small"])
-    assert report.items(Caveats) == (
+    assert report.items(CAVEATS) == (
         "small",
         "The methods were not evaluated on the same starts, so their numbers are not paired "
         "(BC: 3 from seed 11; DT: 2 from seed 11).",

@@ -37,24 +37,25 @@ from zest_rl.report.content import (
 )
 from zest_rl.report.html import render_html, write_report
 from zest_rl.report.sections import (
-    Caveats,
-    Details,
-    Episodes,
-    Frames,
-    Goals,
-    LearningCurves,
-    Pixels,
-    Ranking,
+    CAVEATS,
+    DETAILS,
+    EPISODES,
+    FRAMES,
+    GOALS,
+    LEARNING_CURVES,
+    PIXELS,
+    RANKING,
+    RESULTS,
+    REWARD_QUALITY,
+    SCORES_OVER_TIME,
+    SUB_GOALS,
+    TASKS,
+    TASKS_AGAINST_GOALS,
+    VIEWS,
+    WARNINGS,
     Report,
-    Results,
-    RewardQuality,
-    ScoresOverTime,
     Section,
-    SubGoals,
-    Tasks,
-    TasksAgainstGoals,
-    Views,
-    Warnings,
+    SectionKind,
 )
 
 N_STEPS = 30
@@ -104,12 +105,12 @@ def report(video: Path) -> Report:
         "Microwave",
         "The reward ranks episodes.",
         (
-            Results(rows),
-            Tasks((TaskTable("one task", rows, "#task"),)),
-            Caveats(("three seeds only",)),
-            Warnings(("the reward is a clock",)),
-            RewardQuality((QualityTable(("delta", "raw"), quality),)),
-            TasksAgainstGoals(
+            RESULTS(rows),
+            TASKS((TaskTable("one task", rows, "#task"),)),
+            CAVEATS(("three seeds only",)),
+            WARNINGS(("the reward is a clock",)),
+            REWARD_QUALITY((QualityTable(("delta", "raw"), quality),)),
+            TASKS_AGAINST_GOALS(
                 (
                     Matrix(
                         ("door", "knob"),
@@ -120,29 +121,29 @@ def report(video: Path) -> Report:
                     ),
                 )
             ),
-            Goals(goals),
-            Ranking((Scatter("delta cos", returns, returns / 2, 0.83, (0.71, 0.9)),)),
-            Frames((Strip("the best", (image, image), (0, 30), np.array([0.0, 1.2], np.float32)),)),
-            Views((Curve("all views", "score", steps, steps), Curve("view 1", "score", steps, 2 * steps))),
-            Pixels((pixels,)),
-            ScoresOverTime((Curve("successes", "mean reward", steps, steps),)),
-            SubGoals((Curve("open", "similarity", steps, steps),)),
-            Episodes((episode, dataclasses.replace(episode, title="not scored", scores=None, success=False))),
-            LearningCurves(
+            GOALS(goals),
+            RANKING((Scatter("delta cos", returns, returns / 2, 0.83, (0.71, 0.9)),)),
+            FRAMES((Strip("the best", (image, image), (0, 30), np.array([0.0, 1.2], np.float32)),)),
+            VIEWS((Curve("all views", "score", steps, steps), Curve("view 1", "score", steps, 2 * steps))),
+            PIXELS((pixels,)),
+            SCORES_OVER_TIME((Curve("successes", "mean reward", steps, steps),)),
+            SUB_GOALS((Curve("open", "similarity", steps, steps),)),
+            EPISODES((episode, dataclasses.replace(episode, title="not scored", scores=None, success=False))),
+            LEARNING_CURVES(
                 (
                     Curve("BC", "loss", steps, 1 / (1 + steps)),
                     Curve("DT", "loss", steps, steps, steps - 1, steps + 1),
                 )
             ),
-            Details((("config", {"lr": 1e-4, "folder": Path("runs/a")}),)),
+            DETAILS((("config", {"lr": 1e-4, "folder": Path("runs/a")}),)),
         ),
     )
 
 
 def with_sections(report: Report, *sections: Section[Any]) -> Report:
     """Return the report with other sections of the same kinds."""
-    new = {type(section): section for section in sections}
-    return dataclasses.replace(report, sections=tuple(new.get(type(old), old) for old in report.sections))
+    new = {section.kind: section for section in sections}
+    return dataclasses.replace(report, sections=tuple(new.get(old.kind, old) for old in report.sections))
 
 
 def test_every_section_shows_its_content(report: Report) -> None:
@@ -197,9 +198,9 @@ def test_an_empty_report_has_no_sections() -> None:
 
 
 def test_the_column_of_the_papers_figures_appears_only_with_figures(report: Report) -> None:
-    rows = tuple(dataclasses.replace(row, paper_value=None) for row in report.items(Results))
-    assert 'data-label="Paper"' in render_html(Report("t", "s", (Results(report.items(Results)),)))
-    assert 'data-label="Paper"' not in render_html(Report("t", "s", (Results(rows),)))
+    rows = tuple(dataclasses.replace(row, paper_value=None) for row in report.items(RESULTS))
+    assert 'data-label="Paper"' in render_html(Report("t", "s", (RESULTS(report.items(RESULTS)),)))
+    assert 'data-label="Paper"' not in render_html(Report("t", "s", (RESULTS(rows),)))
 
 
 def test_nothing_outside_the_file_is_referred_to(report: Report) -> None:
@@ -215,6 +216,8 @@ def test_a_hostile_string_in_any_text_of_a_report_is_shown_escaped(report: Repor
     hostile: list[str] = []
 
     def spoil(value: Any) -> Any:
+        if isinstance(value, SectionKind):
+            return value
         if isinstance(value, str):
             if value in ("method", "control", "dataset"):
                 return value
@@ -245,15 +248,15 @@ def test_figures_that_are_not_finite_are_shown_as_a_dash(report: Report) -> None
     scores[3:9] = 0.5
     broken = with_sections(
         report,
-        Results((MethodRow("not run", nan, nan, nan, inf, nan, 0, 0, paper_value=nan),)),
-        Goals((dataclasses.replace(report.items(Goals)[0], spearman=nan),)),
-        Episodes((dataclasses.replace(report.items(Episodes)[0], scores=scores, normalized_return=nan),)),
-        Ranking((Scatter("s", np.array([1, 2, inf], np.float32), np.array([1, nan, 2], np.float32), nan, (nan, nan)),)),
-        LearningCurves((Curve("BC", "loss", np.zeros(2, np.float32), np.full(2, nan, np.float32)),)),
-        Details((("config", {"target": nan, "limits": [inf, np.float32("nan")], "array": np.array([nan])}),)),
-        RewardQuality((QualityTable(("d",), (QualityRow("q", "m", ((nan, nan, inf),)),)),)),
-        TasksAgainstGoals((Matrix(("d",), ("d",), *np.full((3, 1, 1), nan, np.float32)),)),
-        Frames((dataclasses.replace(report.items(Frames)[0], scores=np.array([nan, inf], np.float32)),)),
+        RESULTS((MethodRow("not run", nan, nan, nan, inf, nan, 0, 0, paper_value=nan),)),
+        GOALS((dataclasses.replace(report.items(GOALS)[0], spearman=nan),)),
+        EPISODES((dataclasses.replace(report.items(EPISODES)[0], scores=scores, normalized_return=nan),)),
+        RANKING((Scatter("s", np.array([1, 2, inf], np.float32), np.array([1, nan, 2], np.float32), nan, (nan, nan)),)),
+        LEARNING_CURVES((Curve("BC", "loss", np.zeros(2, np.float32), np.full(2, nan, np.float32)),)),
+        DETAILS((("config", {"target": nan, "limits": [inf, np.float32("nan")], "array": np.array([nan])}),)),
+        REWARD_QUALITY((QualityTable(("d",), (QualityRow("q", "m", ((nan, nan, inf),)),)),)),
+        TASKS_AGAINST_GOALS((Matrix(("d",), ("d",), *np.full((3, 1, 1), nan, np.float32)),)),
+        FRAMES((dataclasses.replace(report.items(FRAMES)[0], scores=np.array([nan, inf], np.float32)),)),
     )
     html = render_html(broken)
     text = re.sub(r"base64,[^\"]*|<style>.*?</style>|<script>.*?</script>", "", html, flags=re.DOTALL)
@@ -279,13 +282,13 @@ def test_the_page_depends_on_the_report_alone(report: Report) -> None:
 
 def test_goal_images_are_embedded_as_thumbnails() -> None:
     wide = GoalPanel("wide", (np.zeros((800, 1600, 3), np.uint8),), ("open",))
-    encoded = re.findall(r'src="data:image/png;base64,([^"]*)"', render_html(Report("t", "s", (Goals((wide,)),))))
+    encoded = re.findall(r'src="data:image/png;base64,([^"]*)"', render_html(Report("t", "s", (GOALS((wide,)),))))
     assert imageio.imread(base64.b64decode(encoded[0])).shape == (80, 160, 3)
 
 
 def test_a_video_that_browsers_cannot_play_is_refused(report: Report, tmp_path: Path) -> None:
     def with_video(path: Path) -> Report:
-        return with_sections(report, Episodes((dataclasses.replace(report.items(Episodes)[0], video=path),)))
+        return with_sections(report, EPISODES((dataclasses.replace(report.items(EPISODES)[0], video=path),)))
 
     with pytest.raises(BadInput, match=r"mpeg4\.mp4 must be an MP4 file with H\.264 video"):
         render_html(with_video(write_video(tmp_path / "mpeg4.mp4", codec="mpeg4")))
@@ -294,7 +297,7 @@ def test_a_video_that_browsers_cannot_play_is_refused(report: Report, tmp_path: 
 
 
 def test_parts_that_do_not_fit_together_are_refused(report: Report) -> None:
-    episode = report.items(Episodes)[0]
+    episode = report.items(EPISODES)[0]
     three, four = np.zeros(3, np.float32), np.zeros(4, np.float32)
     with pytest.raises(
         BadInput, match="an episode: scores and gt_progress must be equally long, got scores 3, gt_prog"

@@ -116,16 +116,21 @@ def _mean_by_step(rewards: Sequence[FloatArray]) -> FloatArray:
 
 def labels(inspections: Sequence[Inspection]) -> list[str]:
     """Name each by its task and goal, and by the settings that differ among datasets of the same task and goal."""
-    described = [(f"{each.task} by {_goal(each)}", _settings(each)) for each in inspections]
-    names = []
-    for name, settings in described:
-        rivals = [other for other_name, other in described if other_name == name]
-        differing = [(k, v) for k, v in settings.items() if any(other[k] != v for other in rivals)]
-        names.append(", ".join([name, *(f"{k} {v}" for k, v in differing)]))
+    names = names_with_settings([(f"{each.task} by {_goal(each)}", _settings(each)) for each in inspections])
     return [
         f"{name} ({each.dataset_id})" if names.count(name) > 1 else name
         for name, each in zip(names, inspections, strict=True)
     ]
+
+
+def names_with_settings(described: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str]:
+    """Append to each name the settings that differ among those of equal name."""
+    names = []
+    for name, settings in described:
+        namesakes = [other for other_name, other in described if other_name == name]
+        differing = [(k, v) for k, v in settings.items() if any(other.get(k) != v for other in namesakes)]
+        names.append(", ".join([name, *(f"{k} {v}" for k, v in differing)]))
+    return names
 
 
 def _goal(inspection: Inspection) -> str:

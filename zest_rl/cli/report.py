@@ -27,12 +27,12 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Group the runs by method, build the report, write it."""
     from zest_rl.report.comparison_page import compare_runs
     from zest_rl.report.html import write_report
-    from zest_rl.report.sections import Results
+    from zest_rl.report.sections import RESULTS
 
     report = compare_runs(config.runs, title=config.title)
     path = write_report(report, config.output)
     return {
         "report": str(path),
-        "rows": {row.method: round(row.mean, 2) for row in report.items(Results)},
+        "rows": {row.method: round(row.mean, 2) for row in report.items(RESULTS)},
         "next": f"open {path} in a browser",
     }

@@ -238,15 +238,23 @@ def line_chart(
     return _image(f"chart {'tall' if tall else 'low'}", label, [ticks, plot], **data)
 
 
+def by_quantity(curves: Iterable[Curve]) -> dict[str, list[Curve]]:
+    """Return the curves of each chart, in the order of their first appearance."""
+    quantities: dict[str, list[Curve]] = {}
+    for curve in curves:
+        quantities.setdefault(curve.quantity, []).append(curve)
+    return quantities
+
+
 def curve_chart(quantity: str, curves: Sequence[Curve], styles: Sequence[str]) -> Markup:
     """Return curves of one quantity, each with its band where it has one."""
     lines = [Line(c.steps, c.values, style, c.band) for c, style in zip(curves, styles, strict=True)]
     return line_chart(lines, f"{quantity} of {', '.join(curve.name for curve in curves)}")
 
 
-def score_range(panels: Iterable[EpisodePanel]) -> tuple[float, float]:
+def score_range(episodes: Iterable[EpisodePanel]) -> tuple[float, float]:
     """Return the lowest and the highest finite score of all episodes, and 0 within."""
-    scores = [panel.scores[np.isfinite(panel.scores)] for panel in panels if panel.scores is not None]
+    scores = [e.scores[np.isfinite(e.scores)] for e in episodes if e.scores is not None]
     every = np.concatenate([*scores, np.zeros(1)])
     return float(every.min()), float(every.max())
 

@@ -11,17 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.analysis.reward_figures import true_returns
 from zest_rl.data.provenance import DatasetRecord
 from zest_rl.data.reader import dataset_path, exists, open_dataset
 from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import Evaluation, evaluation_folder, read_evaluation
 from zest_rl.kitchen.videos import Film, ensure_video
-from zest_rl.metrics import statistics
+from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return
 from zest_rl.report.content import Curve, MethodRow, TaskTable
-from zest_rl.report.episodes import episode_panels, paired_panels
+from zest_rl.report.episodes import paired_episodes, representative_episodes
 from zest_rl.report.goals import goal_panel, goal_scatter
 from zest_rl.report.methods import Method, goal_name, latest_evaluation, methods_of_runs, read_meta
-from zest_rl.report.sections import Caveats, Details, Episodes, Goals, LearningCurves, Ranking, Report, Results, Tasks
+from zest_rl.report.sections import CAVEATS, DETAILS, EPISODES, GOALS, LEARNING_CURVES, RANKING, RESULTS, TASKS, Report
 from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.training.checkpoints import snapshots
@@ -47,8 +48,7 @@ def dataset_row(*dataset_ids: str, paper: float | None = None) -> MethodRow:
     for dataset_id in dataset_ids:
         with open_dataset(dataset_id) as ds:
             facts, truth = ds.describe(), ds.truth()
-        returns = np.array([episode.episode_return for episode in truth])
-        groups.append([statistics.normalized_return(returns, facts["ref_min_score"], facts["ref_max_score"])])
+        groups.append([normalized_return(true_returns(truth), facts["ref_min_score"], facts["ref_max_score"])])
         successes += [episode.success for episode in truth]
     return _row(
         groups,
@@ -62,13 +62,13 @@ def dataset_row(*dataset_ids: str, paper: float | None = None) -> MethodRow:
 
 def _row(groups: list[list[NDArray[np.float64]]], success_rate: float, **named: Any) -> MethodRow:
     """Summarise normalized returns, one (N,) array per task and seed."""
-    estimate = statistics.bootstrap(*groups)
+    estimate = bootstrap(*groups)
     values = np.concatenate([group for task in groups for group in task])
     return MethodRow(
         mean=estimate.value,
         ci_low=estimate.low,
         ci_high=estimate.high,
-        iqm=float(statistics.iqm(values)),
+        iqm=float(iqm(values)),
         success_rate=success_rate,
         n_seeds=len(groups[0]),
         n_episodes=len(values),
@@ -197,27 +197,32 @@ def compare(
     scorer = None
     if goals:
         scorer = StateScorer.load(dataset_path(next(iter(goals.values()))) / SCORER_FILE)
-    shown = [method for method in methods if method.kind == "method"]
-    panels = [p for m in shown for p in episode_panels(m.name, evaluations[m.name][0], scorer, film)]
+    contenders = [method for method in methods if method.kind == "method"]
+    episodes = [
+        episode
+        for method in contenders
+        for episode in representative_episodes(method.name, evaluations[method.name][0], scorer, film)
+    ]
     if scorer is not None:
         scorer.flush()
-    cloned = next((method.name for method in shown if _agent(metas, method) == "bc"), None)
+    agents = {method.name: metas[str(method.runs[0])]["agent"] for method in contenders}
+    cloned = next((name for name, agent in agents.items() if agent == "bc"), None)
     if cloned is not None:
         first = {name: (name, of_seeds[0]) for name, of_seeds in evaluations.items()}
-        others = [method.name for method in shown if _agent(metas, method) != "bc"]
-        panels += [p for name in others for p in paired_panels(first[cloned], first[name], film)]
+        for name in (name for name, agent in agents.items() if agent != "bc"):
+            episodes += paired_episodes(first[cloned], first[name], film)
     curves = (draw(method) for draw in (return_curve, learning_curve) for method in methods)
     return Report(
         title,
         _best_sentence(rows),
         (
-            Results(tuple(rows)),
-            Caveats((*caveats, *_unequal_starts(evaluations))),
-            Goals(tuple(goal_panels)),
-            Ranking(tuple(scatters)),
-            Episodes(tuple(panels)),
-            LearningCurves(tuple(curve for curve in curves if curve is not None)),
-            Details((*(details or {}).items(), *((f"run {Path(run).name}", meta) for run, meta in metas.items()))),
+            RESULTS(rows),
+            CAVEATS([*caveats, *_unequal_starts(evaluations)]),
+            GOALS(goal_panels),
+            RANKING(scatters),
+            EPISODES(episodes),
+            LEARNING_CURVES(curve for curve in curves if curve is not None),
+            DETAILS([*(details or {}).items(), *((f"run {Path(run).name}", meta) for run, meta in metas.items())]),
         ),
     )
 
@@ -248,24 +253,20 @@ def overview(
     by_name = zip(*methods.values(), strict=True)
     rows = [method_row(group[0], *(method.evaluations() for method in group)) for group in by_name]
     rows.insert(0, dataset_row(*sources, paper=paper_demo))
-    scatters = [(task, scatter) for task, report in reports.items() for scatter in report.items(Ranking)]
-    curves = [(task, curve) for task, report in reports.items() for curve in report.items(LearningCurves)]
+    scatters = [(task, scatter) for task, report in reports.items() for scatter in report.items(RANKING)]
+    curves = [(task, curve) for task, report in reports.items() for curve in report.items(LEARNING_CURVES)]
     return Report(
         title,
         _best_sentence(rows, f" over {len(reports)} datasets"),
         (
-            Results(tuple(rows)),
-            Tasks(tuple(TaskTable(task, report.items(Results), pages[task]) for task, report in reports.items())),
-            Caveats(tuple(caveats)),
-            Ranking(tuple(replace(scatter, name=f"{task}: {scatter.name}") for task, scatter in scatters)),
-            LearningCurves(tuple(replace(curve, quantity=f"{task}: {curve.quantity}") for task, curve in curves)),
-            Details(tuple((details or {}).items())),
+            RESULTS(rows),
+            TASKS(TaskTable(task, report.items(RESULTS), pages[task]) for task, report in reports.items()),
+            CAVEATS(caveats),
+            RANKING(replace(scatter, name=f"{task}: {scatter.name}") for task, scatter in scatters),
+            LEARNING_CURVES(replace(curve, quantity=f"{task}: {curve.quantity}") for task, curve in curves),
+            DETAILS((details or {}).items()),
         ),
     )
-
-
-def _agent(metas: Mapping[str, dict[str, Any]], method: Method) -> str:
-    return str(metas[str(method.runs[0])]["agent"])
 
 
 def _best_sentence(rows: Sequence[MethodRow], where: str = "") -> str:

@@ -186,8 +186,8 @@ class Strip:
 
     title: str
     frames: tuple[Frame, ...]
-    steps: tuple[int, ...]
-    """Which step of the episode each is."""
+    steps: NDArray[np.intp]
+    """(n,) which step of the episode each is."""
     scores: FloatArray
     """(n,) float32, normalised: 0 is the lowest and 1 the highest score of the dataset, or of the episode alone."""
 

@@ -8,28 +8,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.evaluation.evaluate import Evaluation, evaluation_folder
+from zest_rl.evaluation.evaluate import Evaluation
 from zest_rl.kitchen.videos import FPS, Film, Video
-from zest_rl.metrics import statistics
+from zest_rl.metrics.statistics import representative
 from zest_rl.report.content import EpisodePanel
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 from zest_rl.types import FloatArray
 
 
-def episode_panels(name: str, evaluation: Evaluation, scorer: StateScorer | None, film: Film) -> list[EpisodePanel]:
+def representative_episodes(
+    name: str, evaluation: Evaluation, scorer: StateScorer | None, film: Film
+) -> list[EpisodePanel]:
     """Best, median and worst episode of an evaluation: video, score over time, ground-truth progress."""
-    panels = []
-    folder = evaluation_folder(evaluation.run, evaluation.config)
-    for which, index in statistics.representative(evaluation.normalized()).items():
+    episodes = []
+    for which, index in representative(evaluation.normalized()).items():
         states: NDArray[np.float64] = evaluation.traces["qpos"][index]
-        video = film(Video(states, folder / f"{which}.mp4"))
+        video = film(Video(states, evaluation.folder / f"{which}.mp4"))
         scores = None if scorer is None else scorer.score_episode(states)
-        panels.append(_panel(f"{name}: {which}", name, evaluation, index, video, scores=scores))
-    return panels
+        episodes.append(_panel(f"{name}: {which}", name, evaluation, index, video, scores=scores))
+    return episodes
 
 
-def paired_panels(left: tuple[str, Evaluation], right: tuple[str, Evaluation], film: Film) -> list[EpisodePanel]:
+def paired_episodes(left: tuple[str, Evaluation], right: tuple[str, Evaluation], film: Film) -> list[EpisodePanel]:
     """Two policies on the same start side by side: where the right one gains most, as usual, and least.
 
     Args:
@@ -40,16 +41,16 @@ def paired_panels(left: tuple[str, Evaluation], right: tuple[str, Evaluation], f
     (left_name, before), (right_name, after) = left, right
     if before.config.starts != after.config.starts:
         return []
-    panels = []
+    episodes = []
     returns = before.normalized()
-    for which, index in statistics.representative(after.normalized() - returns).items():
+    for which, index in representative(after.normalized() - returns).items():
         left_qpos, right_qpos = before.traces["qpos"][index], after.traces["qpos"][index]
         name = f"pair-{artifacts.hash_arrays(left_qpos, right_qpos)[:8]}.mp4"
-        video = film(Video(left_qpos, evaluation_folder(after.run, after.config) / name, beside=right_qpos))
+        video = film(Video(left_qpos, after.folder / name, beside=right_qpos))
         title = f"{left_name} (left, {returns[index]:.0f} %) beside {right_name} (right): {which} gain"
         beside = (left_name, _progress(before, index))
-        panels.append(_panel(title, right_name, after, index, video, beside=beside))
-    return panels
+        episodes.append(_panel(title, right_name, after, index, video, beside=beside))
+    return episodes
 
 
 def _panel(title: str, name: str, evaluation: Evaluation, index: int, video: Path, **drawn: Any) -> EpisodePanel:

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from zest_rl.analysis.reward_figures import true_returns
 from zest_rl.data.images import list_images, read_image
 from zest_rl.data.provenance import RelabelRecord
 from zest_rl.data.reader import Dataset
 from zest_rl.kitchen.tasks import get_task
-from zest_rl.metrics import statistics
+from zest_rl.metrics.reward_quality import returns_of
+from zest_rl.metrics.statistics import MIN_EPISODES_TO_RANK, Estimate, Values, spearman
 from zest_rl.report.content import GoalPanel, Scatter
 from zest_rl.rewards.goals import read_goal, read_text
 from zest_rl.rewards.relabel import GOAL_FOLDER
@@ -19,11 +21,15 @@ from zest_rl.rewards.relabel import GOAL_FOLDER
 
 def goal_scatter(name: str, ds: Dataset) -> Scatter:
     """Return by a relabeled dataset's rewards against its ground-truth return, per episode."""
-    returns = np.array([rewards.sum(dtype=np.float64) for rewards in ds.rewards()])
-    truth = np.array([episode.episode_return for episode in ds.truth()])
-    rho = statistics.Estimate(math.nan, math.nan, math.nan)
-    if len(returns) >= statistics.MIN_EPISODES_TO_RANK:
-        rho = statistics.spearman(returns, truth)
+    returns, truth = returns_of(ds.rewards()), true_returns(ds.truth())
+    rho = Estimate(math.nan, math.nan, math.nan)
+    if len(returns) >= MIN_EPISODES_TO_RANK:
+        rho = spearman(returns, truth)
+    return return_scatter(name, returns, truth, rho)
+
+
+def return_scatter(name: str, returns: Values, truth: Values, rho: Estimate) -> Scatter:
+    """Returns (N,) by the rewards against the true ones (N,), with their rank correlation."""
     return Scatter(name, truth.astype(np.float32), returns.astype(np.float32), rho.value, (rho.low, rho.high))
 
 

@@ -14,19 +14,19 @@ from zest_rl.analysis.reward_figures import FIGURES
 from zest_rl.data.reader import dataset_path
 from zest_rl.metrics.statistics import MIN_EPISODES_TO_RANK, spearman
 from zest_rl.report.content import Curve, Matrix, QualityRow, QualityTable, Scatter, Strip
-from zest_rl.report.goals import goal_panel
+from zest_rl.report.goals import goal_panel, return_scatter
 from zest_rl.report.sections import (
-    Details,
-    Frames,
-    Goals,
-    Pixels,
-    Ranking,
+    DETAILS,
+    FRAMES,
+    GOALS,
+    PIXELS,
+    RANKING,
+    REWARD_QUALITY,
+    SCORES_OVER_TIME,
+    TASKS_AGAINST_GOALS,
+    VIEWS,
+    WARNINGS,
     Report,
-    RewardQuality,
-    ScoresOverTime,
-    TasksAgainstGoals,
-    Views,
-    Warnings,
 )
 
 
@@ -38,33 +38,26 @@ def inspection_report(joint: JointInspection) -> Report:
     views = {
         name: joint.views[each.dataset_id] for name, each in inspections.items() if joint.views.get(each.dataset_id)
     }
-    compared = joint.confusion
+    ends = joint.confusion
+    matrices = [] if ends is None else [Matrix(ends.row_names(), names, ends.means, ends.low, ends.high)]
     n_warnings = sum(map(len, joint.warnings.values()))
     return Report(
         "What these rewards are worth",
         f"Datasets: {len(names)}, warnings: {n_warnings}. Nothing was trained.",
         (
-            Warnings(tuple(f"{dataset}: {text}" for dataset, texts in joint.warnings.items() for text in texts)),
-            RewardQuality((_quality(inspections),)),
-            TasksAgainstGoals(
-                ()
-                if compared is None
-                else (Matrix(compared.row_names(), names, compared.means, compared.low, compared.high),)
+            WARNINGS(f"{dataset}: {text}" for dataset, texts in joint.warnings.items() for text in texts),
+            REWARD_QUALITY([_quality(inspections)]),
+            TASKS_AGAINST_GOALS(matrices),
+            GOALS(
+                goal_panel(name, each.made, dataset_path(each.dataset_id), scatters[name])
+                for name, each in inspections.items()
             ),
-            Goals(
-                tuple(
-                    goal_panel(name, each.made, dataset_path(each.dataset_id), scatters[name])
-                    for name, each in inspections.items()
-                )
-            ),
-            Ranking(tuple(scatter for scatter in scatters.values() if scatter is not None)),
-            Frames(tuple(strip for name in views for strip in _strips(name, inspections[name], views[name]))),
-            Views(tuple(curve for name in views for curve in _by_view(name, views[name]["best"]))),
-            Pixels(tuple(_pixels(name, views[name]["best"]) for name in views)),
-            ScoresOverTime(tuple(curve for name, each in inspections.items() for curve in _over_time(name, each))),
-            Details(
-                tuple((name, {"dataset": each.dataset_id, **each.made.to_json()}) for name, each in inspections.items())
-            ),
+            RANKING(scatter for scatter in scatters.values() if scatter is not None),
+            FRAMES(strip for name in views for strip in _strips(name, inspections[name], views[name])),
+            VIEWS(curve for name in views for curve in _by_view(name, views[name]["best"])),
+            PIXELS(_pixels(name, views[name]["best"]) for name in views),
+            SCORES_OVER_TIME(curve for name, each in inspections.items() for curve in _over_time(name, each)),
+            DETAILS((name, {"dataset": each.dataset_id, **each.made.to_json()}) for name, each in inspections.items()),
         ),
     )
 
@@ -83,18 +76,14 @@ def _scatter(name: str, inspection: Inspection) -> Scatter | None:
     """The returns that were inspected, against the true ones."""
     if inspection.true_returns is None:
         return None
-    rho = inspection.figures["spearman"]
-    truth, returns = (array.astype(np.float32) for array in (inspection.true_returns, inspection.returns))
-    return Scatter(name, truth, returns, rho.value, (rho.low, rho.high))
+    return return_scatter(name, inspection.returns, inspection.true_returns, inspection.figures["spearman"])
 
 
 def _strips(name: str, inspection: Inspection, views: Mapping[str, EpisodeView]) -> list[Strip]:
     low, high = inspection.score_range
     size = high - low or 1.0
     return [
-        Strip(
-            f"{name}: {which}", tuple(view.frames), tuple(map(int, view.steps)), (view.scores[view.steps] - low) / size
-        )
+        Strip(f"{name}: {which}", tuple(view.frames), view.steps, (view.scores[view.steps] - low) / size)
         for which, view in views.items()
     ]
 

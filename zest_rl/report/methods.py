@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from zest_rl.agents.foreign import FOREIGN
+from zest_rl.analysis.inspection import names_with_settings
 from zest_rl.data.provenance import DatasetRecord, RelabelRecord
 from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import Evaluation, EvaluationConfig, check_finished, evaluation_folder, read_evaluation
@@ -43,33 +44,28 @@ class Method:
 def methods_of_runs(runs: Sequence[Path]) -> tuple[Method, ...]:
     """Make one method of the runs that differ in their training seed alone.
 
-    A method is called after its agent and goal, or as `zest adopt` was told; where that does not tell two apart, also
-    by the settings that do.
+    A method is named after its agent and goal, or as `zest adopt` named it; methods of equal name also by the settings
+    in which they differ.
 
     Raises:
         BadInput: a folder is no finished run, or two runs are the same training with the same seed.
     """
     groups: dict[str, dict[int, Path]] = {}
-    settings: dict[str, dict[str, Any]] = {}
+    described: dict[str, tuple[str, dict[str, Any]]] = {}
     for run in runs:
         meta = read_meta(run)
         dataset = f"{meta['dataset']['id']} ({meta['data_sha256'][:8]})"
-        of_run = {"name": _short_name(meta), **meta["config"], "n_updates": meta["n_updates"], "dataset": dataset}
-        key = artifacts.hash_json(of_run)
-        settings[key] = of_run
+        name, settings = _short_name(meta), {**meta["config"], "n_updates": meta["n_updates"], "dataset": dataset}
+        key = artifacts.hash_json([name, settings])
+        described[key] = name, settings
         earlier = groups.setdefault(key, {}).setdefault(meta["seed"], run)
         if earlier != run:
             raise BadInput(
                 f"{earlier} and {run} are the same training with the same seed; give one of them"
                 + (", or tell them apart by --name or --seed of `zest adopt`" if meta["agent"] == FOREIGN else "")
             )
-    methods = []
-    for key, seeds in groups.items():
-        name = settings[key]["name"]
-        rivals = [other for other in settings.values() if other["name"] == name]
-        differing = [(k, v) for k, v in settings[key].items() if any(other.get(k) != v for other in rivals)]
-        methods.append(Method(", ".join([name, *(f"{k} {v}" for k, v in differing)]), tuple(seeds.values())))
-    return tuple(methods)
+    names = names_with_settings(list(described.values()))
+    return tuple(Method(name, tuple(seeds.values())) for name, seeds in zip(names, groups.values(), strict=True))
 
 
 def read_meta(run: Path) -> dict[str, Any]:

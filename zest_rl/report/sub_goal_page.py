@@ -8,7 +8,7 @@ import numpy as np
 
 from zest_rl.analysis.sub_goals import SubGoalScores, rise_in_order
 from zest_rl.report.content import Curve, Strip
-from zest_rl.report.sections import Details, Frames, Report, SubGoals
+from zest_rl.report.sections import DETAILS, FRAMES, SUB_GOALS, Report
 
 
 def sub_goal_report(sub_goals: Sequence[SubGoalScores], details: dict[str, object]) -> Report:
@@ -24,7 +24,7 @@ def sub_goal_report(sub_goals: Sequence[SubGoalScores], details: dict[str, objec
         Strip(
             sub_goal.name,
             sub_goal.frames,
-            tuple(map(int, sub_goal.steps)),
+            sub_goal.steps,
             (sub_goal.scores[sub_goal.steps] - sub_goal.scores.min()) / (np.ptp(sub_goal.scores) or 1.0),
         )
         for sub_goal in sub_goals
@@ -33,5 +33,5 @@ def sub_goal_report(sub_goals: Sequence[SubGoalScores], details: dict[str, objec
     return Report(
         "Similarity to each sub-goal",
         f"The scores {order} the sub-goals: {', '.join(reached)}.",
-        (Frames(tuple(strips)), SubGoals(tuple(curves)), Details(tuple(details.items()))),
+        (FRAMES(strips), SUB_GOALS(curves), DETAILS(details.items())),
     )

@@ -143,7 +143,7 @@ def _methods(comparison: Comparison, cells: Sequence[Cell], task: str) -> list[M
 
 
 def _rows(page: Report) -> dict[str, Any]:
-    from zest_rl.report.sections import Results
+    from zest_rl.report.sections import RESULTS
 
     return {
         row.method: {
@@ -156,15 +156,15 @@ def _rows(page: Report) -> dict[str, Any]:
             "paper": row.paper_value,
             "kind": row.kind,
         }
-        for row in page.items(Results)
+        for row in page.items(RESULTS)
     }
 
 
 def _rank_correlations(page: Report) -> dict[str, Any]:
     """Return Spearman's ρ of ZeST and true returns by goal; None where it is undefined."""
-    from zest_rl.report.sections import Ranking
+    from zest_rl.report.sections import RANKING
 
     return {
         scatter.name: None if math.isnan(scatter.spearman) else {"value": scatter.spearman, "ci95": scatter.ci}
-        for scatter in page.items(Ranking)
+        for scatter in page.items(RANKING)
     }

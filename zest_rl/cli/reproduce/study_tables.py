@@ -82,7 +82,7 @@ def as_markdown(result: Mapping[str, Any]) -> str:
 def study_page(result: Mapping[str, Any], caveats: tuple[str, ...]) -> Report:
     """Build the page: the same tables, with intervals."""
     from zest_rl.report.content import QualityRow, QualityTable
-    from zest_rl.report.sections import Caveats, Details, Report, RewardQuality
+    from zest_rl.report.sections import CAVEATS, DETAILS, REWARD_QUALITY, Report
 
     tasks = _tasks(result)
     intervals = {
@@ -110,9 +110,9 @@ def study_page(result: Mapping[str, Any], caveats: tuple[str, ...]) -> Report:
         f"Best over tasks: {best['name']}. {best['mean']['top_n_success']:.0%} of the highest-scoring frames are "
         f"right, {best['mean']['times_random']:.1f} times as many as at random.",
         (
-            Caveats(caveats),
-            RewardQuality((QualityTable((*tasks, "mean"), tuple(rows)),)),
-            Details(tuple(details.items())),
+            CAVEATS(caveats),
+            REWARD_QUALITY((QualityTable((*tasks, "mean"), tuple(rows)),)),
+            DETAILS(tuple(details.items())),
         ),
     )
 
