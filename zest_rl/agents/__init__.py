@@ -1,7 +1,7 @@
 """Algorithms: one file each, in the same order (config, model, batch, loss, act); the registry is a dict.
 
-To add one, copy the file that is nearest to it and add a line to `AGENTS`. `foreign` is not an algorithm: it runs
-policies that other programs trained.
+To add one, copy the file of the most similar algorithm and add a line to `AGENTS`. `foreign` is not an algorithm: it
+runs policies that other programs trained.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ def get_agent(name: str) -> Agent[Any]:
 
 
 def load_policy(run_dir: Path, device: str = "cpu") -> Policy:
-    """Return the policy that a finished run left in `run_dir`; it acts in the precision it was trained in.
+    """Return the policy of a finished run; it acts in the precision it was trained in.
 
     Raises:
-        ZestError: the run is not finished, or its weights are not the ones that ``meta.json`` names.
+        ZestError: the run is not finished, or its weights differ from those that ``meta.json`` names.
         BadInput: its agent is unknown here, or a foreign policy cannot be read.
     """
     meta: dict[str, Any] = read_json(run_dir / "meta.json")
@@ -60,7 +60,7 @@ def load_policy(run_dir: Path, device: str = "cpu") -> Policy:
         )
     config = agent.config(**meta["config"])
     facts = DataFacts(**{field.name: meta[field.name] for field in fields(DataFacts)})
-    with torch.random.fork_rng(devices=[]):  # building draws weights that are replaced at once
+    with torch.random.fork_rng(devices=[]):  # the random initial weights are replaced below
         model = agent.build(config, facts)
     model.load_state_dict(safetensors.torch.load(weights))
     target = torch.device(device)

@@ -1,11 +1,11 @@
-"""What all agents share: statistics of the data, and the interfaces of agents and policies. No algorithm is here."""
+"""What all agents share: statistics of the data, the optimizer's settings, the interfaces of agents and policies."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeVar, get_args
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ MAX_NORMALIZED = 10.0
 
 @dataclass(frozen=True)
 class DataFacts:
-    """Everything about the training data that the model or the policy needs; stored in ``meta.json`` as it is here."""
+    """Everything about the training data that the model or the policy needs; ``meta.json`` holds the same fields."""
 
     obs_dim: int
     act_dim: int
@@ -47,7 +47,7 @@ class DataFacts:
     """(T+1,) return-to-go of the episode with the largest return; starts at that return and ends at 0."""
 
     def normalize(self, obs: FloatArray) -> FloatArray:
-        """Return ``(obs - mean) / std`` clipped to ± `MAX_NORMALIZED`; obs (…, obs_dim) float32, and so the result."""
+        """Return ``(obs - mean) / std`` clipped to ± `MAX_NORMALIZED`; obs and result (…, obs_dim) float32."""
         mean, std = np.array(self.obs_mean, dtype=np.float32), np.array(self.obs_std, dtype=np.float32)
         normalized: FloatArray = np.clip((obs - mean) / std, -MAX_NORMALIZED, MAX_NORMALIZED).astype(np.float32)
         return normalized
@@ -55,13 +55,13 @@ class DataFacts:
 
 def returns_to_go(rewards: FloatArray) -> FloatArray:
     """Return ``R_t = Σ_{k ≥ t} r_k`` for t = 0 … T, so the last is 0; rewards (T,), result (T+1,) float32."""
-    total = np.zeros(len(rewards) + 1)
-    total[:-1] = np.cumsum(rewards[::-1], dtype=np.float64)[::-1]
-    return total.astype(np.float32)
+    sums = np.zeros(len(rewards) + 1)
+    sums[:-1] = np.cumsum(rewards[::-1], dtype=np.float64)[::-1]
+    return sums.astype(np.float32)
 
 
 def describe_data(episodes: Sequence[Episode]) -> DataFacts:
-    """Measure `episodes`.
+    """Return the facts of `episodes`.
 
     Raises:
         BadInput: there are none, their dimensions differ, or an action leaves [-1, 1].
@@ -69,11 +69,11 @@ def describe_data(episodes: Sequence[Episode]) -> DataFacts:
     if not episodes:
         raise BadInput("training needs at least 1 episode, got 0; check the dataset id and its filters")
     dims = [(e.obs.shape[1], e.actions.shape[1]) for e in episodes]
-    odd = next((i for i, d in enumerate(dims) if d != dims[0]), None)
-    if odd is not None:
+    other = next((i for i, d in enumerate(dims) if d != dims[0]), None)
+    if other is not None:
         raise BadInput(
-            f"all episodes must have the same (obs_dim, act_dim): episode 0 has {dims[0]}, episode {odd} has "
-            f"{dims[odd]}; train on one environment at a time"
+            f"all episodes must have the same (obs_dim, act_dim): episode 0 has {dims[0]}, episode {other} has "
+            f"{dims[other]}; train on one environment at a time"
         )
     largest = max(float(np.abs(e.actions).max()) for e in episodes)
     if largest > 1.0 + 1e-5:
@@ -105,9 +105,9 @@ def resolve_precision(precision: Precision, device: torch.device) -> Precision:
         return precision
     if device.type == "cuda":
         return "bf16" if torch.cuda.is_bf16_supported() else "fp32"
-    flags = Path("/proc/cpuinfo")  # Linux only
-    words = set(flags.read_text().split()) if flags.exists() else set()
-    return "bf16" if words & {"avx512_bf16", "amx_bf16", "bf16"} else "fp32"
+    cpuinfo = Path("/proc/cpuinfo")  # Linux only
+    flags = set(cpuinfo.read_text().split()) if cpuinfo.exists() else set()
+    return "bf16" if flags & {"avx512_bf16", "amx_bf16", "bf16"} else "fp32"
 
 
 def autocast(precision: Precision, device: torch.device) -> torch.autocast:
@@ -115,58 +115,48 @@ def autocast(precision: Precision, device: torch.device) -> torch.autocast:
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")
 
 
-class OptimizerConfig(Protocol):
-    """The fields of a config that `zest_rl.training.loop` reads; all others are the agent's own."""
-
-    @property
-    def learning_rate(self) -> float:
-        """AdamW's step size after warm-up."""
-
-    @property
-    def weight_decay(self) -> float:
-        """AdamW's decoupled weight decay."""
-
-    @property
-    def warmup_updates(self) -> int:
-        """Updates over which the step size rises linearly from 0."""
-
-    @property
-    def grad_clip(self) -> float:
-        """Largest Euclidean norm of the gradient."""
-
-    @property
-    def ema_decay(self) -> float:
-        """Decay of the moving average of the weights, which is what acts."""
-
-    @property
-    def amp(self) -> Precision:
-        """Precision of matrix products; ``auto`` is bf16 where the hardware has it."""
-
-
 Rules = Mapping[str, tuple[bool, str]]  # field: (holds, "must be …")
 
 
-def optimizer_rules(config: OptimizerConfig) -> Rules:
-    """Return the rules of the fields that every agent's config has."""
-    return {
-        "learning_rate": (0 < config.learning_rate < float("inf"), "positive"),
-        "weight_decay": (0 <= config.weight_decay < float("inf"), "0 or positive"),
-        "warmup_updates": (config.warmup_updates >= 0, "0 or positive"),
-        "grad_clip": (0 < config.grad_clip < float("inf"), "positive"),
-        "ema_decay": (0 <= config.ema_decay < 1, "in [0, 1)"),
-        "amp": (config.amp in ("auto", "bf16", "fp32"), "one of auto, bf16, fp32"),
-    }
+@dataclass(frozen=True, kw_only=True)
+class OptimizerConfig:
+    """What the config of every agent inherits: the fields that `zest_rl.training.loop` reads."""
+
+    learning_rate: float = 3e-4
+    """AdamW's step size after warm-up."""
+    weight_decay: float = 1e-4
+    """AdamW's decoupled weight decay."""
+    warmup_updates: int = 200
+    """Updates over which the step size rises linearly from 0."""
+    grad_clip: float = 0.25
+    """Largest Euclidean norm of the gradient."""
+    ema_decay: float = 0.999
+    """Largest decay of the moving average of the weights, which is what acts; 0 acts with the last weights. It rises as
+    (1 + n) / (10 + n): about the last ninth of a training is averaged, until 0.999 is reached after 9000 updates."""
+    amp: Precision = "auto"
+    """Precision of matrix products; auto is bf16 where the hardware has it."""
+
+    def optimizer_rules(self) -> Rules:
+        """Return the rules of these fields."""
+        return {
+            "learning_rate": (0 < self.learning_rate < float("inf"), "positive"),
+            "weight_decay": (0 <= self.weight_decay < float("inf"), "0 or positive"),
+            "warmup_updates": (self.warmup_updates >= 0, "0 or positive"),
+            "grad_clip": (0 < self.grad_clip < float("inf"), "positive"),
+            "ema_decay": (0 <= self.ema_decay < 1, "in [0, 1)"),
+            "amp": (self.amp in get_args(Precision), f"one of {', '.join(get_args(Precision))}"),
+        }
 
 
-def check_fields(what: str, values: Any, rules: Rules) -> None:
+def check_fields(title: str, values: Any, rules: Rules) -> None:
     """Raise one `BadInput` that lists every field of `values` (an object with attributes) that breaks its rule."""
     problems = [f"{f} must be {rule}, got {getattr(values, f)!r}" for f, (holds, rule) in rules.items() if not holds]
     if problems:
-        raise BadInput(f"{what}: " + "; ".join(problems))
+        raise BadInput(f"{title}: " + "; ".join(problems))
 
 
 class Policy(Protocol):
-    """A trained agent at work on N episodes in step: `begin`, then `act` and `observe` in turn, then `end`."""
+    """A trained agent that plays N episodes in lockstep: `begin`, then `act` and `observe` in turn, then `end`."""
 
     agent: str
     """Name in the registry, or ``foreign``."""
@@ -176,13 +166,13 @@ class Policy(Protocol):
     """`begin` needs a target return, and rewards given to `observe` change the actions."""
 
     def begin(self, n_episodes: int, target_return: float | None = None) -> None:
-        """Reset and start N episodes, each asked for `target_return` (in the data's units)."""
+        """Start N new episodes, each asked for `target_return` (in the data's units)."""
 
     def act(self, obs: FloatArray) -> FloatArray:
         """Return actions (N, act_dim) float32 in [-1, 1] for obs (N, obs_dim) float32, the newest of each episode."""
 
     def observe(self, rewards: FloatArray) -> None:
-        """Take the rewards (N,) of the last actions off the returns still asked for."""
+        """Subtract the rewards (N,) of the last actions from the returns still asked for."""
 
     def end(self) -> dict[str, NDArray[Any]]:
         """Release per-episode resources, even after a failure; return further results by name, arrays (N, …)."""
@@ -198,7 +188,7 @@ def check_obs(obs: FloatArray, n_episodes: int, obs_dim: int) -> None:
         raise BadInput("obs must be finite, got NaN or infinity; the simulation has probably diverged")
 
 
-ConfigT = TypeVar("ConfigT")
+ConfigT = TypeVar("ConfigT", bound=OptimizerConfig)
 
 
 @dataclass(frozen=True)
@@ -206,11 +196,11 @@ class Agent(Generic[ConfigT]):
     """One algorithm as `zest_rl.training.loop` sees it."""
 
     config: type[ConfigT]
-    """Flat frozen dataclass with the fields of `OptimizerConfig`; checks itself."""
+    """Frozen dataclass that checks itself."""
     build: Callable[[ConfigT, DataFacts], nn.Module]
     """Model with fresh weights, drawn from torch's global generator."""
     sampler: Callable[[ConfigT, DataFacts, Sequence[Episode]], Sampler]
-    """From the data to a function that draws one batch; ``valid`` in it tells what is not padding."""
+    """From the data to a function that draws one batch; its ``valid``, if any, is False for padding."""
     loss: Callable[[nn.Module, Batch], Tensor]
     """Scalar to minimise: an average over the batch's rows, or over the elements that are valid."""
     policy: Callable[[nn.Module, ConfigT, DataFacts, dict[str, Any], torch.device], Policy]

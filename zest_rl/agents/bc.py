@@ -7,9 +7,9 @@ Deviations from it:
   - hidden size 512, which gives about as many parameters as `dt.DTConfig` has (0.56 and 0.63 million for the kitchen);
   - 1280 transitions per update, as many as the Decision Transformer's 64 windows of 20;
   - learning rate, warm-up, averaged weights and observation normaliser are those of `dt`.
-``top_fraction`` below 1 is the "best x % BC" of that paper: only the episodes with the largest returns are cloned (a
-share of the episodes here, of the time steps there). The normaliser is measured on all episodes nevertheless, so that
-it is the same for every fraction and every agent.
+``top_fraction`` below 1 is the "%BC" of that paper: only the episodes with the largest returns are cloned (a share of
+the episodes here, of the time steps there). The normaliser is still measured on all episodes, so that it is the same
+for every fraction and every agent.
 """
 
 from __future__ import annotations
@@ -28,13 +28,12 @@ from zest_rl.agents.base import (
     Agent,
     Batch,
     DataFacts,
+    OptimizerConfig,
     Policy,
-    Precision,
     Sampler,
     autocast,
     check_fields,
     check_obs,
-    optimizer_rules,
 )
 from zest_rl.types import Episode, FloatArray
 
@@ -42,11 +41,11 @@ from zest_rl.types import Episode, FloatArray
 
 
 @dataclass(frozen=True)
-class BCConfig:
+class BCConfig(OptimizerConfig):
     """Behaviour cloning."""
 
     top_fraction: float = 1.0
-    """Share of the episodes that is cloned, those with the largest returns; 1 clones all and never reads a reward."""
+    """Share of the episodes, those with the largest returns, that is cloned; 1 clones all and never reads a reward."""
     hidden_size: int = 512
     """Units per hidden layer."""
     n_layers: int = 3
@@ -55,19 +54,6 @@ class BCConfig:
     """Share of hidden units that is zeroed while training."""
     batch_size: int = 1280
     """Transitions per update."""
-    learning_rate: float = 3e-4
-    """AdamW's step size after warm-up."""
-    weight_decay: float = 1e-4
-    """AdamW's decoupled weight decay."""
-    warmup_updates: int = 200
-    """Updates over which the step size rises linearly from 0."""
-    grad_clip: float = 0.25
-    """Largest Euclidean norm of the gradient."""
-    ema_decay: float = 0.999
-    """Largest decay of the moving average of the weights, which is what acts; 0 acts with the last weights. It rises as
-    (1 + n) / (10 + n): about the last ninth of a training is averaged, until 0.999 is reached after 9000 updates."""
-    amp: Precision = "auto"
-    """Precision of matrix products; auto is bf16 where the hardware has it."""
 
     def __post_init__(self) -> None:
         check_fields("BC config", self, {
@@ -76,7 +62,7 @@ class BCConfig:
             "n_layers": (self.n_layers >= 1, "at least 1"),
             "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
             "batch_size": (self.batch_size >= 1, "at least 1"),
-            **optimizer_rules(self),
+            **self.optimizer_rules(),
         })  # fmt: skip
 
 
@@ -97,7 +83,7 @@ def build_model(config: BCConfig, facts: DataFacts) -> nn.Module:
 
 
 def make_sampler(config: BCConfig, facts: DataFacts, episodes: Sequence[Episode]) -> Sampler:
-    """Return a function that draws transitions, each of the kept episodes' steps being equally likely."""
+    """Return a function that draws transitions uniformly from the steps of the kept episodes."""
     if config.top_fraction < 1:
         n_kept = math.ceil(config.top_fraction * len(episodes))
         returns = np.array([e.rewards.sum(dtype=np.float64) for e in episodes])
@@ -128,7 +114,7 @@ def loss(model: nn.Module, batch: Batch) -> Tensor:
 
 
 class BCPolicy:
-    """The MLP at work; it has no memory and asks for no return."""
+    """Acts by the MLP; it has no memory and uses no return."""
 
     agent = "bc"
     uses_return = False
@@ -153,10 +139,10 @@ class BCPolicy:
         return actions.cpu().numpy()
 
     def observe(self, rewards: FloatArray) -> None:
-        """Rewards change nothing here."""
+        """Ignore the rewards."""
 
     def end(self) -> dict[str, NDArray[Any]]:
-        """There is nothing to release or to return."""
+        """Return nothing; there are no resources to release."""
         return {}
 
 

@@ -1,13 +1,13 @@
-"""A policy in a process of its own, in another Python or another language: lines of JSON over its pipes.
+"""A policy in a separate process, in another Python or another language: lines of JSON over its pipes.
 
-Each line that it reads on stdin is answered by one line on stdout; ``docs/foreign_policies.md`` has an example::
+The process answers each line on stdin with one line on stdout; ``docs/foreign_policies.md`` has an example::
 
     {"begin": {"n_episodes": N, "obs_dim": 59, "act_dim": 9}}    →  {"ready": true}
     {"obs": [[59 numbers], … N rows]}                            →  {"actions": [[9 numbers], … N rows]}
     end of stdin                                                 →  it exits
 
-One process plays one batch of N episodes in step, from their first observation to their last: one ``begin``, then one
-``obs`` per step. Numbers are written so that they are read back as the same float32.
+One process plays one batch of N episodes in lockstep, from first observation to last: one ``begin``, then one ``obs``
+per step. Numbers are written with enough digits to be read back as the same float32.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from zest_rl.types import FloatArray
 TIMEOUT_VARIABLE, TIMEOUT = "ZEST_POLICY_TIMEOUT", 120.0
 """Seconds that one answer may take; the first one includes the start of the process and its imports."""
 GRACE = 5.0
-"""Seconds between the end of stdin and the process being killed."""
-MAX_ANSWER = 2**24  # bytes: a line that does not end is no answer
+"""Seconds that the process has after the end of stdin before it is killed."""
+MAX_ANSWER = 2**24  # bytes; a longer line is cut and fails to parse
 # The kernel ends the process with ours even if we are killed: a hanging process would not notice that stdin has ended.
 _START = """
 import ctypes, os, signal, sys
@@ -47,13 +47,13 @@ class PolicyProcess:
     """A command that acts; `begin` starts its process and `end` ends it."""
 
     def __init__(self, words: Sequence[str], obs_dim: int, act_dim: int):
-        """Take the command's words.
+        """Check the command; `begin` runs it.
 
         Raises:
-            BadInput: there is no such program, or the timeout in the environment is no number.
+            BadInput: there is no such program, or `TIMEOUT_VARIABLE` is not a number.
         """
         if shutil.which(words[0]) is None:
-            raise BadInput(f"there is no program {words[0]!r} to be run; give its path, or fix PATH")
+            raise BadInput(f"there is no program {words[0]!r}; give its path, or fix PATH")
         try:
             self._timeout = float(os.environ.get(TIMEOUT_VARIABLE, TIMEOUT))
         except ValueError as error:
@@ -66,7 +66,7 @@ class PolicyProcess:
         """Start the process and tell it how many episodes it plays.
 
         Raises:
-            ZestError: it does not answer as it should.
+            ZestError: the answer is late, missing or malformed.
         """
         self.end()
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (`end` closes it)
@@ -76,15 +76,15 @@ class PolicyProcess:
             stdout=subprocess.PIPE,
             stderr=self._errors,
             env={**os.environ, **dict.fromkeys(THREAD_VARIABLES, "1")},  # results must not depend on the machine's load
-            start_new_session=True,  # a group of its own, to be killed as a whole
+            start_new_session=True,  # a new process group, which can be killed as a whole
         )
         self._ask({"begin": {"n_episodes": n_episodes, **self._dims}}, "ready")
 
     def __call__(self, obs: FloatArray) -> Any:
-        """Return what the process answers as actions to obs (N, obs_dim).
+        """Return the process's answer to obs (N, obs_dim): actions, not checked here.
 
         Raises:
-            ZestError: it does not answer as it should.
+            ZestError: the answer is late, missing or malformed.
         """
         return self._ask({"obs": obs.tolist()}, "actions")
 
@@ -133,8 +133,8 @@ class PolicyProcess:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(GRACE)
             code = process.poll()
-            how = "closed its stdout" if code is None else f"ended with exit code {code}"
-            raise ZestError(f"the policy's process {how} instead of answering{self._stderr_tail()}")
+            outcome = "closed its stdout" if code is None else f"ended with exit code {code}"
+            raise ZestError(f"the policy's process {outcome} instead of answering{self._stderr_tail()}")
         try:
             return json.loads(line)[key]
         except (ValueError, TypeError, KeyError):
@@ -144,7 +144,7 @@ class PolicyProcess:
             ) from None
 
     def _stderr_tail(self) -> str:
-        """Return the end of what the process wrote to stderr, for a message."""
+        """Return the last lines of the process's stderr, for a message."""
         assert self._errors is not None
         size = self._errors.seek(0, os.SEEK_END)
         self._errors.seek(max(0, size - 1000))
@@ -153,6 +153,6 @@ class PolicyProcess:
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """Kill the process and what it started."""
+    """Kill the process and its children."""
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)

@@ -1,17 +1,17 @@
-"""Decision Transformer: a causal transformer over (return-to-go, observation, action), asked for a return.
+"""Decision Transformer: a causal transformer over (return-to-go, observation, action), conditioned on a return.
 
 Chen et al. 2021 (https://arxiv.org/abs/2106.01345; ``gym/`` of https://github.com/kzl/decision-transformer at 5605e40).
-The network is `transformers.DecisionTransformerModel`, and a run's ``model.safetensors`` loads into that class as it
-is. The hyper-parameters are theirs (hidden size 128, 3 layers, 1 head, K = 20, ReLU, dropout 0.1, batch 64, gradient
-clip 0.25, weight decay 1e-4). Deviations:
+The network is `transformers.DecisionTransformerModel`, and a run's ``model.safetensors`` loads into that class
+unchanged. The hyper-parameters are theirs (hidden size 128, 3 layers, 1 head, K = 20, ReLU, dropout 0.1, batch 64,
+gradient clip 0.25, weight decay 1e-4). Deviations:
   - returns are divided by the largest absolute return of the data, not by 1000;
   - learning rate 3e-4 with 200 updates of warm-up instead of 1e-4 with 10,000, as we train for thousands of updates,
     not for a hundred thousand; what acts is a moving average of the weights, which single updates do not shake;
   - observations are normalised with a floor under the deviation and a bound on the result (`base.STD_FLOOR`);
-  - ``timesteps="relative"`` counts time from the start of the window, so that acting late is not something new;
-  - padding repeats a valid step instead of a constant; as there, nothing attends to it and the loss leaves it out;
-  - transformers initialises every embedding with a deviation of 0.02, they with torch's default;
-  - dropout masks are drawn four to a 64-bit random number, which is what makes them cheap on a CPU.
+  - ``timesteps="relative"`` counts time from the start of the window, so that late steps use trained embeddings;
+  - padding repeats a valid step instead of a constant; as in theirs, attention and loss leave it out;
+  - transformers initialises every embedding with a standard deviation of 0.02, theirs has torch's default;
+  - four elements of a dropout mask share a 64-bit random number, which makes masks cheap on a CPU.
 ``condition_on_return=False`` is the null control: the return-to-go is zero at every step, in training and acting.
 """
 
@@ -31,13 +31,12 @@ from zest_rl.agents.base import (
     Agent,
     Batch,
     DataFacts,
+    OptimizerConfig,
     Policy,
-    Precision,
     Sampler,
     autocast,
     check_fields,
     check_obs,
-    optimizer_rules,
     returns_to_go,
 )
 from zest_rl.errors import BadInput
@@ -50,11 +49,11 @@ Timesteps = Literal["absolute", "relative"]
 
 
 @dataclass(frozen=True)
-class DTConfig:
+class DTConfig(OptimizerConfig):
     """Decision Transformer."""
 
     condition_on_return: bool = True
-    """False zeroes the return-to-go: the same network without what the scores can tell it."""
+    """False zeroes the return-to-go: the same network without any information from the scores."""
     context_len: int = 20
     """K, the steps that the network sees."""
     timesteps: Timesteps = "absolute"
@@ -69,19 +68,6 @@ class DTConfig:
     """Share zeroed of embeddings, residual branches and attention weights while training."""
     batch_size: int = 64
     """Windows of K steps per update."""
-    learning_rate: float = 3e-4
-    """AdamW's step size after warm-up."""
-    weight_decay: float = 1e-4
-    """AdamW's decoupled weight decay."""
-    warmup_updates: int = 200
-    """Updates over which the step size rises linearly from 0."""
-    grad_clip: float = 0.25
-    """Largest Euclidean norm of the gradient."""
-    ema_decay: float = 0.999
-    """Largest decay of the moving average of the weights, which is what acts; 0 acts with the last weights. It rises as
-    (1 + n) / (10 + n): about the last ninth of a training is averaged, until 0.999 is reached after 9000 updates."""
-    amp: Precision = "auto"
-    """Precision of matrix products; auto is bf16 where the hardware has it."""
 
     def __post_init__(self) -> None:
         check_fields("DT config", self, {
@@ -95,7 +81,7 @@ class DTConfig:
             "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
             "timesteps": (self.timesteps in get_args(Timesteps), f"one of {', '.join(get_args(Timesteps))}"),
             "batch_size": (self.batch_size >= 1, "at least 1"),
-            **optimizer_rules(self),
+            **self.optimizer_rules(),
         })  # fmt: skip
 
 
@@ -122,7 +108,7 @@ class CheapDropout(nn.Dropout):
 
 def build_model(config: DTConfig, facts: DataFacts) -> nn.Module:
     """Return transformers' model, its unused parts (token table, observation and return heads) frozen."""
-    from transformers import DecisionTransformerConfig, DecisionTransformerModel  # 3 s that other agents do without
+    from transformers import DecisionTransformerConfig, DecisionTransformerModel  # takes 3 s, for this agent alone
 
     model = DecisionTransformerModel(
         DecisionTransformerConfig(
@@ -172,8 +158,8 @@ def predict_actions(model: nn.Module, batch: Batch) -> Tensor:
 def make_sampler(config: DTConfig, facts: DataFacts, episodes: Sequence[Episode]) -> Sampler:
     """Return a function that draws windows of up to K steps, padded on the left.
 
-    Every step of the data is equally likely to start a window, which is to draw an episode in proportion to its
-    length and then a start in it. A window ends K steps later or with its episode.
+    Every step of the data is equally likely to start a window: an episode is drawn in proportion to its length, then a
+    start in it. A window ends K steps later or with its episode.
 
     Raises:
         BadInput: all returns are zero although the model is to be conditioned on them.
@@ -220,7 +206,7 @@ def loss(model: nn.Module, batch: Batch) -> Tensor:
 
 
 class DTPolicy:
-    """The transformer at work on the last K steps of N episodes."""
+    """Acts by the transformer on the last K steps of N episodes."""
 
     agent = "dt"
 
@@ -240,7 +226,7 @@ class DTPolicy:
         self._window: deque[dict[str, FloatArray]] = deque(maxlen=self._config.context_len)
 
     def begin(self, n_episodes: int, target_return: float | None = None) -> None:
-        """Reset and start N episodes.
+        """Start N new episodes.
 
         Raises:
             BadInput: the model is conditioned on returns and `target_return` is not a finite number.
@@ -257,7 +243,7 @@ class DTPolicy:
         """Return actions (N, act_dim) float32 in [-1, 1] for obs (N, obs_dim) float32, the newest of each episode.
 
         Raises:
-            BadInput: the shape is wrong, or the episode outlasts the longest of the data and timesteps are absolute.
+            BadInput: the shape is wrong, or with absolute timesteps the episode is longer than all of the data.
         """
         check_obs(obs, len(self._remaining), self._facts.obs_dim)
         bound = self._facts.max_steps
@@ -287,11 +273,11 @@ class DTPolicy:
         return actions.copy()
 
     def observe(self, rewards: FloatArray) -> None:
-        """Take the rewards (N,) of the last actions off the returns still asked for."""
+        """Subtract the rewards (N,) of the last actions from the returns still asked for."""
         self._remaining = self._remaining - rewards
 
     def end(self) -> dict[str, NDArray[Any]]:
-        """There is nothing to release or to return."""
+        """Return nothing; there are no resources to release."""
         return {}
 
 

@@ -1,18 +1,18 @@
-"""Policies that other programs trained; they act like those that are trained here.
+"""Policies that other programs trained, behind the same interface as those trained here.
 
-| spec | what acts |
+| spec | policy |
 |---|---|
 | `torchscript:FILE.pt` | a TorchScript module or function, as d3rlpy's `save_policy("FILE.pt")` writes it |
-| `onnx:FILE.onnx` | an ONNX graph of one input (extra `foreign`); weights beside it are in `FILE.onnx.data` |
-| `d3rlpy:FILE.d3` | a model of d3rlpy, in the Python that has d3rlpy: a process |
+| `onnx:FILE.onnx` | an ONNX graph of one input (extra `foreign`); external weights lie in `FILE.onnx.data` |
+| `d3rlpy:FILE.d3` | a d3rlpy model, run in a separate process by a Python that has d3rlpy |
 | `command:WORDS …` | any program that speaks the protocol of `zest_rl.agents.child` |
-| `NAME:REST` | what another package registers (group `zest_rl.policies`): a function from REST to a callable |
+| `NAME:REST` | an entry point of another package (group `zest_rl.policies`): a function from REST to a callable |
 
-All of them take raw observations (N, obs_dim) float32, as they stand in the dataset, and give actions (N, act_dim) in
-[-1, 1]. A callable, or a TorchScript module, with a method `begin(n_episodes)` is told that N new episodes start.
+All of them map raw observations (N, obs_dim) float32, as in the dataset, to actions (N, act_dim) in [-1, 1]. If a
+callable or a TorchScript module has a method `begin(n_episodes)`, it is called when N new episodes start.
 
-Nothing is unpickled in this process; but TorchScript, ONNX, commands and packages run code of whoever made them, and
-d3rlpy unpickles its models in its own process.
+Nothing is unpickled in this process; but TorchScript, ONNX, commands and packages run their authors' code, and d3rlpy
+unpickles its models in its own process.
 """
 
 from __future__ import annotations
@@ -55,16 +55,16 @@ Act = Callable[[FloatArray], Any]
 
 @dataclass(frozen=True)
 class PolicyIdentity:
-    """Which policy acts; policies with equal files have equal identities, whatever their paths."""
+    """What defines a policy; policies with equal files have equal identities, whatever their paths."""
 
     family: str
     """One of `FAMILIES`, or a name that another package registered."""
     words: tuple[str, ...]
-    """A file of the run (``policy/FILE``), the words of a command, or what stands after ``NAME:``."""
+    """A file of the run (``policy/FILE``), the words of a command, or the text after ``NAME:``."""
     files: Mapping[str, str]
-    """Path (from the run's folder, or absolute) → sha256, of all files that the policy is known to consist of."""
+    """Path (from the run's folder, or absolute) → sha256 of each file that the policy consists of, as far as known."""
     code: str = ""
-    """Entry point and version of what another package registered."""
+    """Entry point and version of the other package."""
     originals: Mapping[str, Path] = field(default_factory=dict)
     """Path in the run's folder → the file to be copied there."""
 
@@ -82,7 +82,7 @@ def parse(spec: str, python: str | None = None) -> tuple[str, str]:
     """Split a spec (see the table above) into family and rest; no file needs to be there yet.
 
     Raises:
-        BadInput: unknown family, nothing after the colon, or a Python that is missing or not wanted.
+        BadInput: unknown family, nothing after the colon, or a Python that is missing or superfluous.
     """
     family, _, rest = spec.partition(":")
     known = (*FAMILIES, *_registered())
@@ -99,7 +99,7 @@ def parse(spec: str, python: str | None = None) -> tuple[str, str]:
 
 
 def identify(spec: str, python: str | None = None) -> PolicyIdentity:
-    """Find which policy a spec (see the table above) names, and hash its files; nothing is run.
+    """Resolve a spec (see the table above) and hash the policy's files; nothing is run.
 
     Args:
         spec: the policy.
@@ -114,14 +114,13 @@ def identify(spec: str, python: str | None = None) -> PolicyIdentity:
         return PolicyIdentity(family, words, _hash_files(words))
     if family not in FAMILIES:
         entry = _registered()[family]
-        word = _absolute(rest)
-        files = _hash_files([word])
+        words = (_absolute(rest),)
         version = entry.dist.version if entry.dist is not None else "unknown"
-        return PolicyIdentity(family, (word,), files, code=f"{entry.value} {version}")
+        return PolicyIdentity(family, words, _hash_files(words), code=f"{entry.value} {version}")
     path = Path(rest).expanduser()
     if not path.is_file():
         raise BadInput(f"there is no file {path}; give what the training program saved")
-    weights = path.with_name(f"{path.name}.data")  # where torch's exporter puts what an ONNX file refers to
+    weights = path.with_name(f"{path.name}.data")  # where torch's exporter puts external weights
     parts = [path, weights] if family == "onnx" and weights.is_file() else [path]
     originals = {f"{POLICY_FOLDER}/{part.name}": part for part in parts}
     program = () if python is None else (_find_program(python),)
@@ -158,7 +157,7 @@ def _hash_files(words: Sequence[str]) -> dict[str, str]:
     """Hash the files that the words of a command name.
 
     Raises:
-        BadInput: a word names a folder, which does not tell what in it belongs to the policy.
+        BadInput: a word names a folder, in which any file might belong to the policy.
     """
     files = {}
     for word in words:
@@ -188,7 +187,7 @@ def _find_program(python: str) -> str:
 
 
 class ForeignPolicy:
-    """A policy that another program trained; it is asked for no return, and its actions are checked."""
+    """A policy that another program trained; it uses no return, and its actions are checked."""
 
     agent = FOREIGN
     uses_return = False
@@ -209,10 +208,10 @@ class ForeignPolicy:
             _call(self._act, "begin", n_episodes)
 
     def act(self, obs: FloatArray) -> FloatArray:
-        """Return actions (N, act_dim) float32 for obs (N, obs_dim) float32, clipped to [-1, 1], which is counted.
+        """Return actions (N, act_dim) float32 for obs (N, obs_dim) float32, clipped to [-1, 1]; `end` counts those.
 
         Raises:
-            ZestError: the policy fails, or what it gives has another shape, or is not finite.
+            ZestError: the policy fails, or its actions have another shape or are not finite.
         """
         check_obs(obs, len(self._n_clipped), self.meta["obs_dim"])
         with self._naming_the_policy(f"obs of shape {obs.shape}"):
@@ -233,7 +232,7 @@ class ForeignPolicy:
         return clipped
 
     def observe(self, rewards: FloatArray) -> None:
-        """Rewards are not handed on."""
+        """Ignore the rewards."""
 
     def end(self) -> dict[str, NDArray[Any]]:
         """End the policy's process, if it has one; return ``clipped`` (N,), the number of actions beyond [-1, 1]."""
@@ -246,19 +245,19 @@ class ForeignPolicy:
         return f"policy {self.meta['name']!r} ({self.meta['policy']['family']})"
 
     @contextmanager
-    def _naming_the_policy(self, doing: str) -> Iterator[None]:
-        """Turn whatever the other program raises into a `ZestError` that names the policy."""
+    def _naming_the_policy(self, call: str) -> Iterator[None]:
+        """Turn any error of the other program into a `ZestError` that names the policy."""
         try:
             yield
         except ZestError as error:
             raise ZestError(f"{self._name}: {error}") from error
         except Exception as error:
             last = (str(error).strip().splitlines() or [""])[-1]
-            raise ZestError(f"{self._name} failed on {doing} ({type(error).__name__}: {last})") from error
+            raise ZestError(f"{self._name} failed on {call} ({type(error).__name__}: {last})") from error
 
 
 def _call(policy: Act, method: str, *arguments: Any) -> None:
-    """Call a method that not every policy has."""
+    """Call a method if the policy has it."""
     bound = getattr(policy, method, None)
     if callable(bound):
         bound(*arguments)
@@ -269,7 +268,7 @@ def load(run_dir: Path, meta: dict[str, Any], device: torch.device) -> ForeignPo
 
     Raises:
         BadInput: a file cannot be read, or its family is not known here.
-        ZestError: a file is missing or was changed, or what reads it is not installed.
+        ZestError: a file is missing or was changed, or the library that reads it is not installed.
     """
     identity = PolicyIdentity.from_json(meta["policy"])
     for name, sha256 in identity.files.items():
@@ -279,7 +278,7 @@ def load(run_dir: Path, meta: dict[str, Any], device: torch.device) -> ForeignPo
                 f"{path} is missing or was changed since `zest adopt` saw it, which makes it another policy; restore "
                 "it, or adopt the new one"
             )
-    paths = {name: str(run_dir / name) for name in identity.files}  # a path that is absolute stays as it is
+    paths = {name: str(run_dir / name) for name in identity.files}  # absolute paths stay as they are
     words = [paths.get(word, word) for word in identity.words]
     if identity.family == "torchscript":
         return ForeignPolicy(_read_torchscript(Path(words[0]), device), meta)
@@ -295,7 +294,7 @@ def load(run_dir: Path, meta: dict[str, Any], device: torch.device) -> ForeignPo
 def _read_torchscript(path: Path, device: torch.device) -> Act:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)  # torch recommends another format, but this is used
+            warnings.simplefilter("ignore", FutureWarning)  # torch recommends another format
             module = torch.jit.load(str(path), map_location=device).eval()  # type: ignore[no-untyped-call]
     except (RuntimeError, ValueError) as error:
         raise BadInput(
@@ -349,19 +348,19 @@ def _run_onnx(session: Any, name: str, obs: FloatArray) -> NDArray[Any]:
 
 
 def _build_registered(identity: PolicyIdentity) -> Act:
-    """Return what the registered function of another package makes of the rest of the spec."""
+    """Call the registered function of another package with the rest of the spec."""
     entry = _registered().get(identity.family)
     if entry is None:
         raise BadInput(
             f"no installed package registers policies {identity.family}:, as {identity.code} did when this one was "
             "adopted; install it again"
         )
-    who = f"{entry.value}, which is registered for {entry.name}:,"
+    registered = f"{entry.value}, which is registered for {entry.name}:,"
     try:
         act = entry.load()(identity.words[0])
     except Exception as error:
-        raise ZestError(f"{who} failed on {identity.words[0]!r} ({type(error).__name__}: {error})") from error
+        raise ZestError(f"{registered} failed on {identity.words[0]!r} ({type(error).__name__}: {error})") from error
     if not callable(act):
-        raise ZestError(f"{who} must return a callable from obs to actions, got {type(act).__name__}")
+        raise ZestError(f"{registered} must return a callable from obs to actions, got {type(act).__name__}")
     built: Act = act
     return built

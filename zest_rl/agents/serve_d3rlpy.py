@@ -1,6 +1,6 @@
-"""Acts for zest_rl with a model that d3rlpy saved, in the Python that has d3rlpy: ``serve_d3rlpy.py MODEL.d3``.
+"""Serves a model that d3rlpy saved, in a Python that has d3rlpy: ``serve_d3rlpy.py MODEL.d3``.
 
-`zest_rl.agents.child` starts it and describes what passes. It needs d3rlpy alone, of any Python that d3rlpy runs on.
+`zest_rl.agents.child` starts it and describes the protocol. It imports d3rlpy alone, not zest_rl.
 """
 
 from __future__ import annotations
@@ -11,16 +11,18 @@ import sys
 
 
 def main() -> None:
-    """Answer on the stdout that there was at the start; whatever else is printed goes to stderr."""
+    """Answer on the original stdout; everything else that is printed goes to stderr."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
-    del sys.path[0]  # the folder of this file, whose names d3rlpy's imports must not meet
+    del sys.path[0]  # the folder of this file, whose modules must not shadow those that d3rlpy imports
     import d3rlpy
     import numpy as np
 
     model = d3rlpy.load_learnable(sys.argv[1], device="cpu:0")
     if not isinstance(model, d3rlpy.algos.QLearningAlgoBase):
-        sys.exit(f"{type(model).__name__} acts on returns, which are not handed out; serve it by a program of your own")
+        sys.exit(
+            f"{type(model).__name__} acts on returns, which this protocol does not send; serve it by your own program"
+        )
     for line in sys.stdin:
         message = json.loads(line)
         if "begin" in message:

@@ -1,7 +1,7 @@
 """Policies that other programs trained → run folders, evaluated and compared like those of `zest_rl.training.runs`.
 
-A folder has copies of the policy's files under ``policy/`` (a command's files stay where they are), and a ``meta.json``
-with the keys of a training's that do not depend on how it was trained, and these::
+A folder holds copies of the policy's files under ``policy/`` (a command's files stay where they are) and a
+``meta.json`` with those keys of a trained run that do not depend on the training, and these::
 
     name        row of tables
     policy      family, words and files with their sha256: see `zest_rl.agents.foreign.PolicyIdentity`
@@ -27,7 +27,7 @@ from zest_rl.training.runs import default_run_dir, scorer_files
 from zest_rl.types import Episode
 
 N_TRIED = 8
-"""Episodes whose first observations a policy has to act on before it is adopted."""
+"""Episodes whose first observations a policy must act on before it is adopted."""
 
 
 def adopt(
@@ -40,14 +40,14 @@ def adopt(
     run_dir: Path | None = None,
     on_start: Callable[[Path], None] | None = None,
 ) -> Path:
-    """Try a policy, and make a run folder of it; a folder that holds it already is left as it is.
+    """Make a run folder of a policy, after a trial; a folder that already holds it is left as it is.
 
     Args:
-        policy: what acts, as the table of `zest_rl.agents.foreign` lists.
-        dataset_id: Minari dataset that it was trained on; it is tried on some of its observations.
+        policy: a spec as in the table of `zest_rl.agents.foreign`.
+        dataset_id: Minari dataset that it was trained on, whose observations it is tried on.
         name: row of tables; default the file's name and the family. Policies with equal names are one method, one for
             each training seed.
-        seed: that it was trained with.
+        seed: of its training.
         python: for ``d3rlpy:``, the Python that has d3rlpy.
         run_dir: folder of this run alone; default runs/DATASET-NAME-seedN-HASH, where a changed file has another HASH.
         on_start: called with the run folder before the policy is tried.
@@ -57,7 +57,7 @@ def adopt(
 
     Raises:
         BadInput: there is no such policy or dataset, the name is empty, or the folder holds something else.
-        ZestError: the policy fails, or its actions are not what they must be. No folder is left then.
+        ZestError: the policy fails, or its actions have the wrong shape or are not finite. Then no folder is left.
     """
     identity = foreign.identify(policy, python)
     if name is None:
@@ -65,10 +65,10 @@ def adopt(
     if not name.strip() or seed < 0:
         raise BadInput(f"a policy needs a name and a seed of at least 0, got {name!r} and {seed}")
     with open_dataset(dataset_id) as dataset:
-        episodes, described, files = dataset.episodes(), dataset.describe(), scorer_files(dataset)
+        episodes, description, files = dataset.episodes(), dataset.describe(), scorer_files(dataset)
     if run_dir is None:
         slug = re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")
-        digest = artifacts.hash_json([identity.to_json(), name, described])[:8]
+        digest = artifacts.hash_json([identity.to_json(), name, description])[:8]
         run_dir = Path(f"{default_run_dir(slug, dataset_id, seed)}-{digest}")
     if on_start is not None:
         on_start(run_dir)
@@ -83,7 +83,7 @@ def adopt(
         "obs_dim": facts.obs_dim,
         "act_dim": facts.act_dim,
         "data_sha256": artifacts.hash_arrays(*(a for e in episodes for a in (e.obs, e.actions, e.rewards))),
-        "dataset": described,
+        "dataset": description,
     }
     with artifacts.lock(run_dir):
         if (run_dir / "meta.json").exists():
@@ -106,7 +106,7 @@ def adopt(
 
 
 def _try(policy: foreign.ForeignPolicy, episodes: Sequence[Episode]) -> None:
-    """Let it act on the first two observations of some episodes in step."""
+    """Let the policy act on the first two observations of some episodes in lockstep."""
     try:
         policy.begin(len(episodes))
         for step in range(2):

@@ -1,4 +1,4 @@
-"""All that changes while a policy is trained, and how it survives a cut: ``checkpoints/update-N`` of a run folder."""
+"""The state of a training, and how it survives an interruption: ``checkpoints/update-N`` of a run folder."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ N_CHECKPOINTS = 2
 
 @dataclass
 class TrainState:
-    """What a checkpoint holds, with torch's random generators."""
+    """Everything that changes in a training; a checkpoint holds this and torch's random generators."""
 
     model: nn.Module
     optimizer: torch.optim.Optimizer
@@ -33,7 +33,7 @@ class TrainState:
 
     @classmethod
     def start(cls, model: nn.Module, weight_decay: float, seed: int) -> TrainState:
-        """Return the state before the first update; AdamW trains what requires a gradient."""
+        """Return the state before the first update; AdamW trains the parameters that require a gradient."""
         trained = {name: p for name, p in model.named_parameters() if p.requires_grad}
         optimizer = torch.optim.AdamW(trained.values(), weight_decay=weight_decay, fused=True)
         average = {name: p.detach().clone() for name, p in trained.items()}
@@ -44,10 +44,10 @@ class TrainState:
         """Trained parameters by name, in the optimizer's order."""
         return {name: p for name, p in self.model.named_parameters() if p.requires_grad}
 
-    def follow(self, params: list[nn.Parameter], decay: float) -> None:
-        """Move the average towards `params`; while there were few updates, the decay is (1 + n) / (10 + n) at most.
+    def update_average(self, params: list[nn.Parameter], decay: float) -> None:
+        """Move the average towards `params`; after n updates the decay is at most (1 + n) / (10 + n).
 
-        That is the rule of TensorFlow's ``ExponentialMovingAverage``.
+        This is the rule of TensorFlow's ``ExponentialMovingAverage``.
         """
         decay = min(decay, (1 + self.update) / (10 + self.update))
         with torch.no_grad():
@@ -55,7 +55,7 @@ class TrainState:
                 mean.lerp_(parameter, 1 - decay)
 
     def averaged_weights(self) -> dict[str, Tensor]:
-        """Return the model's state dict on the CPU, with the average in the place of what was trained."""
+        """Return the model's state dict on the CPU, with averages in place of the trained parameters."""
         return {name: tensor.cpu() for name, tensor in (self.model.state_dict() | self.average).items()}
 
 
@@ -68,9 +68,9 @@ def save_checkpoint(run_dir: Path, state: TrainState) -> None:
         for key, tensor in state.optimizer.state[parameter].items()
     }
     generators = {"cpu": torch.get_rng_state()}
-    cuda = next(state.model.parameters()).device
-    if cuda.type == "cuda":
-        generators["cuda"] = torch.cuda.get_rng_state(cuda)
+    device = next(state.model.parameters()).device
+    if device.type == "cuda":
+        generators["cuda"] = torch.cuda.get_rng_state(device)
     weights = state.model.state_dict()
     parts = {"model": weights, "optimizer": moments, "average": state.average, "generators": generators}
     artifacts.check_free_space(run_dir, sum(t.nbytes for tensors in parts.values() for t in tensors.values()))
@@ -95,17 +95,17 @@ def _checkpoints(run_dir: Path) -> list[Path]:
 
 
 def snapshot_folder(run_dir: Path, update: int) -> Path:
-    """Where the policy after so many updates is kept, if it is."""
+    """Return the folder of the policy after `update` updates, whether or not it is kept."""
     return run_dir / "snapshots" / f"update-{update:09d}"
 
 
 def snapshots(run_dir: Path) -> list[Path]:
-    """Folders of the policies that a training kept on its way, the earliest first."""
+    """Return the folders of the policies that a training kept along the way, the earliest first."""
     return sorted((run_dir / "snapshots").glob("update-*"))
 
 
 def resume(run_dir: Path, state: TrainState) -> None:
-    """Bring `state` and torch's generators to the newest checkpoint, if there is one.
+    """Restore `state` and torch's generators from the newest checkpoint, if there is one.
 
     Raises:
         ZestError: the checkpoint is damaged.

@@ -1,8 +1,8 @@
 """Several processes, one training: the processes of ``torchrun`` share every batch and average their gradients.
 
-All of them draw the same batch and keep a share of its rows each, so that a training means the same however many
-processes it has: the batch size is that of all of them, and where nothing is random but the batches (no dropout), the
-weights agree with those of one process but for rounding.
+All of them draw the same batch and each keeps a share of its rows, so that a training does not depend on the number of
+processes: the batch size is that of all together, and if only the batches are random (no dropout), the weights agree
+with those of one process up to rounding.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ if TYPE_CHECKING:  # the command line calls `launched` before it imports heavy p
     from torch import Tensor
 
 PATIENCE = timedelta(hours=1)
-"""How long a process waits for the others: the slowest may read its data from a busy disk."""
+"""How long a process waits for the others, of which the slowest may read its data from a busy disk."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """The processes of one training, as one of them sees them. A process that is alone is a group, too."""
+    """The processes of one training, as seen by one of them; a single process is a group of size 1."""
 
     rank: int = 0
     size: int = 1
@@ -37,10 +37,10 @@ class Group:
         return self.rank == 0
 
     def share(self, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], float]:
-        """Return this process's rows of a batch, and the weight of a loss that is an average over them.
+        """Return this process's rows of a batch, and the weight of its loss.
 
-        The mean of all processes' weighted losses is the loss of the whole batch. A loss averages over rows, or, where
-        a batch has ``valid``, over its elements that are true.
+        The mean of all processes' weighted losses is the loss of the whole batch. A loss averages over rows or, if the
+        batch has ``valid``, over the elements where that is true.
 
         Raises:
             BadInput: there are fewer rows than processes.
@@ -59,7 +59,7 @@ class Group:
         return share, self.size * len(next(iter(share.values()))) / n_rows
 
     def average(self, tensors: Sequence[Tensor]) -> None:
-        """Replace each tensor by its mean over the processes; all give the same shapes in the same order.
+        """Replace each tensor by its mean over the processes, which all pass the same shapes in the same order.
 
         Raises:
             ZestError: another process is gone.
@@ -70,7 +70,7 @@ class Group:
         import torch.distributed as dist
 
         flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
-        with _others():
+        with _naming_lost_processes():
             dist.all_reduce(flat)
         sizes = [tensor.numel() for tensor in tensors]
         parts = (flat / self.size).split(sizes)  # type: ignore[no-untyped-call]
@@ -78,7 +78,7 @@ class Group:
             tensor.copy_(part.view_as(tensor))
 
     def agree(self, **facts: Any) -> None:
-        """Wait for all processes, and compare what must be equal in all of them.
+        """Wait for all processes and check that `facts` are equal in all of them.
 
         Raises:
             ZestError: they differ, or another process is gone.
@@ -87,11 +87,13 @@ class Group:
             return
         import torch.distributed as dist
 
-        seen: list[Any] = [None] * self.size
-        with _others():
-            dist.all_gather_object(seen, facts)
-        for rank, theirs in enumerate(seen):
-            differing = [f"{name} is {seen[0][name]!r} and {theirs[name]!r}" for name in facts if theirs != seen[0]]
+        gathered: list[Any] = [None] * self.size
+        with _naming_lost_processes():
+            dist.all_gather_object(gathered, facts)
+        for rank, theirs in enumerate(gathered):
+            differing = [
+                f"{name} is {gathered[0][name]!r} and {theirs[name]!r}" for name in facts if theirs != gathered[0]
+            ]
             if differing:
                 raise ZestError(
                     f"the processes of a training must have the same data and the same run folder, but for the first "
@@ -100,7 +102,7 @@ class Group:
 
 
 @contextmanager
-def _others() -> Iterator[None]:
+def _naming_lost_processes() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:  # gloo and NCCL have no finer kind
@@ -108,18 +110,18 @@ def _others() -> Iterator[None]:
 
 
 def launched() -> Group:
-    """Return what ``torchrun`` says of this process: its rank, and how many there are."""
+    """Return this process's rank and the number of processes, as ``torchrun`` sets them."""
     return Group(int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1)))
 
 
 def local_index() -> int:
-    """Index of this process among those of its machine, which is also that of its GPU."""
+    """Return the index of this process on its machine, which is also the index of its GPU."""
     return int(os.environ.get("LOCAL_RANK", 0))
 
 
 @contextmanager
 def joined(device: torch.device) -> Iterator[Group]:
-    """Join the processes that ``torchrun`` started for as long as the context is open; alone, do nothing."""
+    """Join the processes that ``torchrun`` started while the context is open; a single process does nothing."""
     group = launched()
     if group.size == 1:
         yield group
@@ -129,7 +131,7 @@ def joined(device: torch.device) -> Iterator[Group]:
 
     if device.type == "cuda":
         torch.cuda.set_device(device)
-    with _others():
+    with _naming_lost_processes():
         dist.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=PATIENCE)
     try:
         yield group

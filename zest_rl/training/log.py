@@ -21,7 +21,7 @@ class MetricsLog:
     """Appends rows to the log of a run; use it as a context manager."""
 
     def __init__(self, run_dir: Path, n_done: int) -> None:
-        """Open the log, and drop what a killed run logged past update `n_done`."""
+        """Open the log, and drop the rows that a killed run logged after update `n_done`."""
         path, header = run_dir / "metrics.csv", ",".join(("update", *COLUMNS))
         lines = path.read_text().splitlines() if path.exists() and n_done else []
         kept = [line for line in lines[1:] if line.count(",") == len(COLUMNS) and int(line.partition(",")[0]) <= n_done]

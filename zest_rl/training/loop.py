@@ -1,19 +1,19 @@
 """Sample → loss → step → log → save / resume. Knows no algorithm and no environment.
 
-A run folder, and what each part of it is for::
+A run folder holds::
 
-    run.json            what was asked for; a rerun that asks for something else is refused
+    run.json            the arguments; a rerun with other ones is refused
     metrics.csv, tb/    loss, gradient norm, learning rate, updates per second; tb/ is for TensorBoard
     checkpoints/        the last two states of an unfinished run, each with a sha256 manifest
-    snapshots/          policies on the way, if asked for: each with the two files below, as `zest evaluate` takes them
+    snapshots/          intermediate policies, if asked for: each has the two files below, which `zest evaluate` takes
     model.safetensors   the weights to act with: the moving average of the trained ones
-    meta.json           everything needed to load and to trace them; written last, so it says "finished"
+    meta.json           everything needed to load and to trace them; written last, so its presence means "finished"
 
-A run that was killed at any moment and is started again with the same arguments ends with the same bits as one that
-was not (on a CPU, with the same number of threads): weights, their average, optimizer, both random generators and the
-running means are restored from the last checkpoint, and rows of the log after it are dropped.
+A run that was killed and is started again with the same arguments ends with the same bits as an uninterrupted one (on
+a CPU, with the same number of threads): weights, their average, optimizer, both random generators and the running means
+are restored from the last checkpoint, and later rows of the log are dropped.
 
-Under ``torchrun`` the processes share the work (`zest_rl.training.distributed`); the first alone writes.
+Under ``torchrun`` the processes share the work (`zest_rl.training.distributed`); only the first writes.
 """
 
 from __future__ import annotations
@@ -35,13 +35,7 @@ import torch
 from torch import nn
 
 from zest_rl.agents import get_agent
-from zest_rl.agents.base import (
-    OptimizerConfig,
-    autocast,
-    check_fields,
-    describe_data,
-    resolve_precision,
-)
+from zest_rl.agents.base import OptimizerConfig, autocast, check_fields, describe_data, resolve_precision
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint, snapshot_folder
@@ -49,12 +43,12 @@ from zest_rl.training.distributed import Group, joined, launched, local_index
 from zest_rl.training.log import MetricsLog
 from zest_rl.types import Episode
 
-RESULT_KEYS = ("n_params", "model_sha256", "train_seconds", "made_by")  # keys of meta.json that only the end knows
+RESULT_KEYS = ("n_params", "model_sha256", "train_seconds", "made_by")  # keys of meta.json that are known at the end
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """How long and where a policy is trained, whatever the algorithm; the algorithm has a config of its own."""
+    """How long and where a policy is trained; each algorithm has its own config besides."""
 
     n_updates: int = 5000
     """Gradient steps."""
@@ -65,9 +59,9 @@ class TrainingConfig:
     threads: int | None = None
     """CPU threads; default torch's own. The last digits of the result depend on it."""
     checkpoint_every: int = 500
-    """Updates between checkpoints, from which a cut run goes on."""
+    """Updates between checkpoints, from which an interrupted run goes on."""
     log_every: int = 50
-    """Updates between log rows (metrics.csv, TensorBoard), each of which holds means over these updates."""
+    """Updates between log rows (metrics.csv, TensorBoard), which hold means over these updates."""
     snapshot_every: int | None = None
     """Updates between policies kept in RUN/snapshots, which `zest evaluate` takes too; default none."""
 
@@ -86,7 +80,7 @@ class OnProgress(Protocol):
     """Called after every logged row."""
 
     def __call__(self, n: int, **fields: float) -> None:
-        """Take the number of updates since the last call (at first, since update 0), and the row: loss and others."""
+        """Take the number of updates since the last call (at first, since update 0), and the row by `COLUMNS`."""
 
 
 def fit(
@@ -100,22 +94,22 @@ def fit(
     files: Mapping[str, bytes] = MappingProxyType({}),
     on_progress: OnProgress | None = None,
 ) -> Path:
-    """Train a policy, or go on with a run that was cut short; return `run_dir`. A finished run returns at once.
+    """Train a policy, or go on with an interrupted run; return `run_dir`. A finished run returns at once.
 
     `zest_rl.training.runs.train` calls this with a dataset's episodes and facts.
 
     Args:
         agent: name in `zest_rl.agents.AGENTS`.
         agent_config: that agent's config.
-        episodes: the data; the rewards in them are all that is known about quality.
+        episodes: the data; their rewards are the only information about quality.
         run_dir: folder of this run alone.
         config: how long and where.
         meta: facts about the data (JSON), copied into ``meta.json`` beside the run's own; part of the run's identity.
-        files: name → content of what else the run and its snapshots hold.
+        files: name → content of further files of the run and its snapshots.
         on_progress: see `OnProgress`.
 
     Raises:
-        BadInput: an argument is out of range, the data do not suit, or `run_dir` holds another run.
+        BadInput: an argument is out of range, the data are unsuitable, or `run_dir` holds another run.
         ZestError: the loss is not finite, a checkpoint is damaged, the folder cannot be written to, or another process
             of this training is gone.
     """
@@ -125,7 +119,7 @@ def fit(
     device = _find_device(config.device)
     facts = describe_data(episodes)
     sample = definition.sampler(agent_config, facts, episodes)
-    launched().share(sample(np.random.default_rng(config.seed)))  # a batch that is too small is refused before all else
+    launched().share(sample(np.random.default_rng(config.seed)))  # a batch that is too small is refused first
     precision = resolve_precision(agent_config.amp, device)
     request: dict[str, Any] = {
         "agent": agent,
@@ -140,9 +134,9 @@ def fit(
     }
     if launched().size > 1:
         request["n_processes"] = launched().size
-    taken = sorted(meta.keys() & {*request, *asdict(facts), *RESULT_KEYS})
-    if taken:
-        raise BadInput(f"meta must not use the keys {', '.join(taken)}, which meta.json has already; rename them")
+    clashing = sorted(meta.keys() & {*request, *asdict(facts), *RESULT_KEYS})
+    if clashing:
+        raise BadInput(f"meta must not use the keys {', '.join(clashing)}, which meta.json has already; rename them")
     request |= meta
     described = request | asdict(facts)
 
@@ -180,7 +174,7 @@ def fit(
                 norm = nn.utils.clip_grad_norm_(params, agent_config.grad_clip)
                 state.optimizer.step()
                 state.update += 1
-                state.follow(params, agent_config.ema_decay)
+                state.update_average(params, agent_config.ema_decay)
                 state.recent.append((loss.item(), norm.item()))
                 if not all(map(math.isfinite, state.recent[-1])):
                     raise ZestError(
@@ -210,7 +204,7 @@ def fit(
                 if at_checkpoint:
                     _reseed_others(config.seed, group, state.update)
                 if group.leads and not is_last:
-                    # before the checkpoint: a run that goes on from there does not come by here again
+                    # before the checkpoint: a run resumed from there does not reach this update again
                     if config.snapshot_every is not None and state.update % config.snapshot_every == 0:
                         _write_snapshot(run_dir, state, described, files)
                     if at_checkpoint:
@@ -230,10 +224,10 @@ def _learning_rate(config: OptimizerConfig, n_done: int) -> float:
 
 
 def _reseed_others(seed: int, group: Group, update: int) -> None:
-    """Seed every process but the first anew, which is done at the start and at each checkpoint.
+    """Reseed every process but the first, at the start and at each checkpoint.
 
-    So they drop other units than the first process, whose generator is in the checkpoint, and the same ones whether the
-    run was cut there or not.
+    So their dropout differs from that of the first process, whose generator is in the checkpoint, and is the same
+    whether or not the run was interrupted there.
     """
     if not group.leads:
         torch.manual_seed(int(np.random.SeedSequence([seed, group.rank, update]).generate_state(1)[0]))
@@ -241,7 +235,7 @@ def _reseed_others(seed: int, group: Group, update: int) -> None:
 
 @contextmanager
 def _torch_set_up(seed: int, threads: int, device: torch.device) -> Iterator[None]:
-    """Seed torch and set its threads; put both back at the end."""
+    """Seed torch and set its threads; restore both at the end."""
     before = torch.get_num_threads()
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         try:
@@ -276,14 +270,14 @@ def _find_device(name: str) -> torch.device:
 
 @contextmanager
 def _claimed(run_dir: Path, request: dict[str, Any], group: Group) -> Iterator[bool]:
-    """Hold a run folder for this training, on all of its processes; yield whether the run in it is finished.
+    """Reserve a run folder for all processes of this training; yield whether the run in it is finished.
 
-    On success the checkpoints are removed at the end, and no process leaves before all files are there.
+    On success the checkpoints are removed at the end, and no process leaves before all files are written.
     """
     with artifacts.lock(run_dir) if group.leads else nullcontext():
         if group.leads:
             _check_request(run_dir, request)
-        group.agree(data_sha256=request["data_sha256"], precision=request["precision"])  # and wait for the check
+        group.agree(data_sha256=request["data_sha256"], precision=request["precision"])  # and wait for `_check_request`
         finished = (run_dir / "meta.json").exists()
         group.agree(finished=finished)
         yield finished
@@ -293,7 +287,7 @@ def _claimed(run_dir: Path, request: dict[str, Any], group: Group) -> Iterator[b
 
 
 def _check_request(run_dir: Path, request: dict[str, Any]) -> None:
-    """Write ``run.json``, or check that the one that is there asks for the same."""
+    """Write ``run.json``, or check that the existing one holds the same arguments."""
     path = run_dir / "run.json"
     if path.exists():
         before, now = _flat(artifacts.read_json(path)), _flat(json.loads(json.dumps(request)))
@@ -322,7 +316,7 @@ def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _write_snapshot(run_dir: Path, state: TrainState, described: dict[str, Any], files: Mapping[str, bytes]) -> None:
-    """Keep the policy of this moment as the one of a training that ends here."""
+    """Keep the current policy as if the training ended here."""
     folder = snapshot_folder(run_dir, state.update)
     if not folder.exists():
         with artifacts.staged_folder(folder) as staging:

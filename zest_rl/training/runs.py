@@ -1,4 +1,4 @@
-"""A dataset → a run folder that is complete without it: what the data are, and the scorer of their rewards."""
+"""A dataset → a run folder that is usable without it: it holds the data's facts and the scorer of their rewards."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def train(
     run_dir: Path | None = None,
     on_progress: OnProgress | None = None,
 ) -> Path:
-    """Train a policy on a dataset, or go on with a run that was cut short; a finished run returns at once.
+    """Train a policy on a dataset, or go on with an interrupted run; a finished run returns at once.
 
     Args:
         agent: name in `zest_rl.agents.AGENTS`.
-        dataset_id: Minari dataset; its rewards are all that is known about quality.
+        dataset_id: Minari dataset; its rewards are the only information about quality.
         agent_config: that agent's config; default its defaults.
         config: how long and where; default the defaults of `TrainingConfig`.
         run_dir: folder of this run alone; default `default_run_dir`.
@@ -35,10 +35,8 @@ def train(
         dataset has one, so that the policy can be evaluated with online scores.
 
     Raises:
-        BadInput: an argument is out of range, there is no such dataset or it does not suit, or the folder holds another
-            run.
-        ZestError: the loss is not finite, a file is damaged, the folder cannot be written to, or another process of
-            this training is gone.
+        BadInput: there is no such dataset, or as in `fit`.
+        ZestError: a file of the dataset is damaged, or as in `fit`.
     """
     config = TrainingConfig() if config is None else config
     with open_dataset(dataset_id) as dataset:
@@ -56,11 +54,11 @@ def train(
 
 
 def default_run_dir(label: str, dataset_id: str, seed: int) -> Path:
-    """Return ``runs/DATASET-LABEL-seedN``, where the label is an agent or says which policy was adopted."""
+    """Return ``runs/DATASET-LABEL-seedN``, where the label is the agent or the adopted policy's name."""
     return Path("runs") / f"{dataset_id.split('/')[-1]}-{label}-seed{seed}"
 
 
 def scorer_files(dataset: Dataset) -> dict[str, bytes]:
-    """Return what a run on a dataset must hold to be scored online: name → content; nothing if it was not scored."""
+    """Return the files that a run needs for online scores: name → content; none if the dataset has no scorer."""
     path = dataset.path / SCORER_FILE
     return {SCORER_FILE: path.read_bytes()} if path.exists() else {}
