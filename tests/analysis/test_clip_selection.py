@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from zest_rl import cli
-from zest_rl.analysis.clip_selection import GOAL_SHARE, candidates, enough
+from zest_rl.analysis.clip_selection import GOAL_SHARE, clip_pool, things_with
 from zest_rl.analysis.clips import LABELS, OPENING, VIDEOS, Clip, embed_clips, folder_of_clips, something_something
 from zest_rl.data.video import read_frames
 from zest_rl.embedders import load_embedder
@@ -125,24 +125,24 @@ def test_clips_are_embedded_once(root: Path) -> None:
 def test_candidates_are_the_frames_of_the_other_clips() -> None:
     clips = [Clip(Path(str(i)), thing) for i, thing in enumerate("aaabb")]
     embeddings = [np.full((5, 2), 10 * i, np.float32) + np.arange(5, dtype=np.float32)[:, None] for i in range(5)]
-    narrow = candidates(clips, embeddings, "a", left_out=1)
+    narrow = clip_pool(clips, embeddings, "a", left_out=1)
     assert set(narrow.clip) == {0, 2}
     assert len(narrow.embeddings) == 8, "x_0 is no candidate"
     np.testing.assert_array_equal(narrow.starts[:, 0], 10 * narrow.clip)
     assert round(5 * GOAL_SHARE) == 1
     np.testing.assert_array_equal(narrow.satisfies, narrow.embeddings[:, 0] % 10 == 4)
-    other = candidates(clips, embeddings, "a", left_out=1, diverse=True, same_context=False)
+    other = clip_pool(clips, embeddings, "a", left_out=1, diverse=True, same_context=False)
     assert set(other.clip) == {0, 2, 3, 4}
     assert (other.starts[:, 0] != 10 * other.clip).all()
     assert set(other.starts[:, 0] / 10) <= {0, 2, 3, 4}
     assert set(other.clip[other.satisfies]) == {0, 2}, "the end of another object is no goal"
-    elsewhere = candidates(clips, embeddings, "a", left_out=1, same_context=False)
+    elsewhere = clip_pool(clips, embeddings, "a", left_out=1, same_context=False)
     np.testing.assert_array_equal(elsewhere.starts[:, 0], 20 - 10 * elsewhere.clip)  # of the other one of two
-    action = candidates(clips, embeddings, "a", diverse=True, any_thing=True)
+    action = clip_pool(clips, embeddings, "a", diverse=True, any_thing=True)
     assert set(action.clip[action.satisfies]) == {0, 1, 2, 3, 4}, "the end of another object shows the action"
-    assert set(candidates(clips, embeddings, "b").clip) == {3, 4}, "the goal is not one of these clips"
-    assert enough(clips, 3) == ["a"]
-    assert enough(clips, 2) == ["a", "b"]
+    assert set(clip_pool(clips, embeddings, "b").clip) == {3, 4}, "the goal is not one of these clips"
+    assert things_with(clips, 3) == ["a"]
+    assert things_with(clips, 2) == ["a", "b"]
 
 
 def test_the_verb_judges_the_frames_that_score_highest(root: Path, zest: Callable[..., dict[str, Any]]) -> None:

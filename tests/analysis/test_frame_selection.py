@@ -11,7 +11,7 @@ import pytest
 from read_dataset import read
 from tiny_dataset import COLLECTED
 
-from zest_rl.analysis.frame_selection import Candidates, draw_candidates, score_as_actions, score_as_goals
+from zest_rl.analysis.frame_selection import FramePool, draw_pool, score_pool
 from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.tasks import TASKS
@@ -25,26 +25,26 @@ MICRO = TASKS["micro"]
 
 
 @pytest.fixture
-def candidates(collected: str) -> Candidates:
+def pool(collected: str) -> FramePool:
     """Forty frames of the tiny dataset."""
-    return draw_candidates([collected], 40)
+    return draw_pool([collected], 40)
 
 
-def test_frames_are_drawn_with_their_trajectory_its_start_and_its_task(candidates: Candidates) -> None:
+def test_frames_are_drawn_with_their_trajectory_its_start_and_its_task(pool: FramePool) -> None:
     episodes = read(COLLECTED, Dataset.states)
-    assert len(candidates.states) == len(candidates.trajectory) == 40
-    assert candidates.task == ("micro",) * len(episodes)
-    for state, trajectory in zip(candidates.states, candidates.trajectory, strict=True):
+    assert len(pool.states) == len(pool.trajectory) == 40
+    assert pool.task == ("micro",) * len(episodes)
+    for state, trajectory in zip(pool.states, pool.trajectory, strict=True):
         assert (episodes[trajectory][1:] == state).all(axis=1).any()
-    np.testing.assert_array_equal(candidates.starts, [episode[0] for episode in episodes])
-    again = draw_candidates([COLLECTED], 40)
-    np.testing.assert_array_equal(again.states, candidates.states)
-    assert not np.array_equal(draw_candidates([COLLECTED], 40, seed=1).states, candidates.states)
-    assert len(draw_candidates([COLLECTED], 10**6).states) == sum(len(episode) - 1 for episode in episodes)
+    np.testing.assert_array_equal(pool.starts, [episode[0] for episode in episodes])
+    again = draw_pool([COLLECTED], 40)
+    np.testing.assert_array_equal(again.states, pool.states)
+    assert not np.array_equal(draw_pool([COLLECTED], 40, seed=1).states, pool.states)
+    assert len(draw_pool([COLLECTED], 10**6).states) == sum(len(episode) - 1 for episode in episodes)
 
 
 def test_satisfied_goals_are_those_of_the_recorded_ground_truth(collected: str) -> None:
-    every = draw_candidates([collected], 10**6)
+    every = draw_pool([collected], 10**6)
     truth = np.concatenate([episode.rewards for episode in read(collected, Dataset.truth)])
     np.testing.assert_array_equal(every.satisfies(MICRO), truth >= 0.999)
     assert every.satisfies(MICRO).any()
@@ -53,47 +53,47 @@ def test_satisfied_goals_are_those_of_the_recorded_ground_truth(collected: str) 
     assert not every.does(TASKS["knob2"]).any(), "turning on is something else"
 
 
-def test_the_context_is_of_the_same_or_always_of_another_trajectory(candidates: Candidates) -> None:
-    same = candidates.contexts("same", 0)
-    np.testing.assert_array_equal(same, candidates.starts[candidates.trajectory])
+def test_the_context_is_of_the_same_or_always_of_another_trajectory(pool: FramePool) -> None:
+    same = pool.contexts("same", 0)
+    np.testing.assert_array_equal(same, pool.starts[pool.trajectory])
     for seed in range(5):
-        other = candidates.contexts("different", seed)
+        other = pool.contexts("different", seed)
         assert (other != same).any(axis=1).all()
-        assert all((candidates.starts == row).all(axis=1).any() for row in other)
+        assert all((pool.starts == row).all(axis=1).any() for row in other)
     with pytest.raises(BadInput, match="unknown context 'none'"):
-        candidates.contexts("none", 0)  # type: ignore[arg-type]
-    alone = replace(candidates, starts=candidates.starts[:1], trajectory=np.zeros_like(candidates.trajectory))
+        pool.contexts("none", 0)  # type: ignore[arg-type]
+    alone = replace(pool, starts=pool.starts[:1], trajectory=np.zeros_like(pool.trajectory))
     with pytest.raises(BadInput, match="needs at least 2 trajectories"):
         alone.contexts("different", 0)
 
 
-def test_scores_are_the_scorer_s_and_find_the_open_door(candidates: Candidates) -> None:
-    scores = score_as_goals(candidates, CONFIG, VIEWS, n_workers=1)
-    scorer = StateScorer.build(CONFIG, VIEWS, candidates.starts[0], n_workers=1)
+def test_scores_are_the_scorer_s_and_find_the_open_door(pool: FramePool) -> None:
+    scores = score_pool(pool, CONFIG, VIEWS, n_workers=1)
+    scorer = StateScorer.build(CONFIG, VIEWS, pool.starts[0], n_workers=1)
     expected = [
-        scorer.score_episode(np.stack([candidates.starts[i], state]))[-1]
-        for i, state in zip(candidates.trajectory, candidates.states, strict=True)
+        scorer.score_episode(np.stack([pool.starts[i], state]))[-1]
+        for i, state in zip(pool.trajectory, pool.states, strict=True)
     ]
     np.testing.assert_allclose(scores, [expected], atol=1e-6)
-    reached = candidates.satisfies(MICRO)
+    reached = pool.satisfies(MICRO)
     assert scores[0, reached].mean() > scores[0, ~reached].mean()
 
 
-def test_repeats_draw_other_goals(candidates: Candidates) -> None:
+def test_repeats_draw_other_goals(pool: FramePool) -> None:
     config = replace(CONFIG, goal="drawings")
-    rows = score_as_goals(candidates, config, VIEWS, n_repeats=3, n_goals=1, n_workers=1)
+    rows = score_pool(pool, config, VIEWS, n_repeats=3, n_goals=1, n_workers=1)
     assert rows.shape == (3, 40)
     assert len({row.tobytes() for row in rows}) > 1
     with pytest.raises(BadInput, match=r"pictures, 99 cannot be drawn of them"):
-        score_as_goals(candidates, config, VIEWS, n_goals=99, n_workers=1)
+        score_pool(pool, config, VIEWS, n_goals=99, n_workers=1)
 
 
-def test_an_action_is_seen_from_the_views_of_the_trajectory_s_own_task(candidates: Candidates) -> None:
+def test_an_action_is_seen_from_the_views_of_the_trajectory_s_own_task(pool: FramePool) -> None:
     of_another_task = replace(VIEWS, task="sdoor")
-    scores = score_as_actions(candidates, CONFIG, of_another_task, n_workers=1)
-    goal = StateScorer.build(CONFIG, of_another_task, candidates.starts[0], n_workers=1).scorer
+    scores = score_pool(pool, CONFIG, of_another_task, ask="actions", n_workers=1)
+    goal = StateScorer.build(CONFIG, of_another_task, pool.starts[0], n_workers=1).scorer
     seen = StateScorer.of(replace(goal, views=VIEWS), n_workers=1)
-    expected = seen.score_pairs(candidates.contexts("same", 0), candidates.states)
+    expected = seen.score_pairs(pool.contexts("same", 0), pool.states)
     np.testing.assert_allclose(scores, [expected], atol=1e-6)
     assert np.ptp(scores) > 0
 
@@ -112,17 +112,17 @@ def test_the_verbs_tell_how_much_better_than_chance_a_goal_is(
 
 
 def test_x_0_of_another_trajectory_matters_where_starts_differ(
-    candidates: Candidates, capsys: pytest.CaptureFixture[str]
+    pool: FramePool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from zest_rl import cli
 
-    assert candidates.start_alike(VIEWS), "the robot is hidden"
-    assert not candidates.start_alike(replace(VIEWS, robot=True, tolerance=1e-3))
-    ajar = candidates.starts.copy()
+    assert pool.start_alike(VIEWS), "the robot is hidden"
+    assert not pool.start_alike(replace(VIEWS, robot=True, tolerance=1e-3))
+    ajar = pool.starts.copy()
     ajar[1:, 22] = [-0.1, -0.2, -0.3]  # the microwave
-    for starts, equal in ((candidates.starts, True), (ajar, False)):
-        pool = replace(candidates, starts=starts)
-        same, other = (score_as_goals(pool, CONFIG, VIEWS, context=c, n_workers=1) for c in ("same", "different"))
+    for starts, equal in ((pool.starts, True), (ajar, False)):
+        moved = replace(pool, starts=starts)
+        same, other = (score_pool(moved, CONFIG, VIEWS, context=c, n_workers=1) for c in ("same", "different"))
         assert np.allclose(same, other) == equal
     words = ("--views", "1", "--tolerance", "0.05", "--n-frames", "60", "--top", "5", "--n-workers", "1")
     assert cli.main(["select", "goals", COLLECTED, "--context", "different", "--n-repeats", "1", *words]) == 0
@@ -135,9 +135,9 @@ def test_what_cannot_be_selected_from_is_refused(collected: str, capsys: pytest.
     assert cli.main(["select", "goals", collected, "--task", "sdoor", "--n-frames", "20"]) == 2
     assert "only 0 of 20 candidates satisfy the goal of 'sdoor'" in capsys.readouterr().err
     with pytest.raises(BadInput, match="at least 1 dataset, each once, and 1 frame of each, got none and 5"):
-        draw_candidates([], 5)
+        draw_pool([], 5)
     with pytest.raises(BadInput, match="each once"):
-        draw_candidates([collected, collected], 5)
+        draw_pool([collected, collected], 5)
     for wrong in ("--top", "--n-repeats", "--n-frames", "--views"):
         assert cli.main(["select", "goals", collected, wrong, "0"]) == 2
         assert "must be at least 1" in capsys.readouterr().err

@@ -13,7 +13,7 @@ from tiny_dataset import COLLECTED
 
 from zest_rl.analysis.cross_task import inspect_datasets
 from zest_rl.analysis.inspection import Inspection, inspect, labels
-from zest_rl.analysis.reward_figures import FIGURES, warnings
+from zest_rl.analysis.reward_figures import FIGURES, reward_warnings
 from zest_rl.data import reader
 from zest_rl.data.provenance import RelabelRecord, ScorerRecord
 from zest_rl.data.reader import Dataset
@@ -99,8 +99,8 @@ SCORES = [np.array([0.0, 0.5, 1.0], np.float32), np.array([0.0, 0.1, 0.2], np.fl
 )
 def test_each_degenerate_reward_has_its_warning(figure: str, value: float, expected: str) -> None:
     figures = dict.fromkeys(NEED_NO_TRUTH, FINE)
-    assert warnings(SCORES, figures) == []
-    (warning,) = warnings(SCORES, {**figures, figure: Estimate(value, value, value)})
+    assert reward_warnings(SCORES, figures) == []
+    (warning,) = reward_warnings(SCORES, {**figures, figure: Estimate(value, value, value)})
     assert expected in warning
 
 
@@ -114,20 +114,20 @@ def test_each_degenerate_reward_has_its_warning(figure: str, value: float, expec
 )
 def test_returns_that_do_not_rank_the_episodes_are_warned_of(rho: Estimate, expected: str) -> None:
     figures = {**dict.fromkeys((figure.key for figure in FIGURES), FINE), "spearman": Estimate(0.9, 0.8, 0.95)}
-    assert warnings(SCORES, figures) == []
-    (warning,) = warnings(SCORES, {**figures, "spearman": rho})
+    assert reward_warnings(SCORES, figures) == []
+    (warning,) = reward_warnings(SCORES, {**figures, "spearman": rho})
     assert expected in warning
 
 
 def test_constant_scores_and_constant_returns_are_warned_of() -> None:
     figures = dict.fromkeys(NEED_NO_TRUTH, FINE)
-    assert "tell nothing apart" in warnings([np.ones(3, np.float32)] * 3, figures)[0]
+    assert "tell nothing apart" in reward_warnings([np.ones(3, np.float32)] * 3, figures)[0]
     nearly = [np.float32(0.7) + np.float32(1e-6) * score for score in SCORES]
-    assert "tell nothing apart" in warnings(nearly, figures)[0]
-    assert warnings([np.float32(1e-6) * score for score in SCORES], figures) == [], "small is not constant"
-    assert warnings([np.float32(0.999) + np.float32(8e-4) * score for score in SCORES], figures) == []
+    assert "tell nothing apart" in reward_warnings(nearly, figures)[0]
+    assert reward_warnings([np.float32(1e-6) * score for score in SCORES], figures) == [], "small is not constant"
+    assert reward_warnings([np.float32(0.999) + np.float32(8e-4) * score for score in SCORES], figures) == []
     alike = [np.array([0.0, 1.0], np.float32), np.array([1.0, 0.0], np.float32)]
-    assert "same return" in warnings(alike, figures)[0]
+    assert "same return" in reward_warnings(alike, figures)[0]
 
 
 def test_differences_are_judged_as_the_trainer_sees_them(collected: str, scored: str) -> None:

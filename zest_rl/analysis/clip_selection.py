@@ -1,13 +1,14 @@
-"""Clips of real video → candidates of goal and action selection, scored by the first and last frame of other clips.
+"""Clips of real video → goal and action selection among their frames, scored by first and last frames of other clips.
 
-A clip shows one object that is acted on from its start to its end: its first frame is a start, its last one a goal, and
-its last `GOAL_SHARE` of frames count as reaching the goal of the same object, and as showing the action that all clips
-share. That reading is ours; Cui et al. 2022 (§5.2) do not say which frames do.
+A clip shows an action on one object from start to end: its first frame is a start, its last frame a goal, and its last
+`GOAL_SHARE` of frames count as reaching the goal of the same object, and as showing the action that all clips share.
+That is our reading; Cui et al. 2022 (§5.2) do not say which frames count.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,21 +26,21 @@ from zest_rl.rewards.scores import Features, Similarity, score_views
 from zest_rl.types import FloatArray
 
 GOAL_SHARE = 0.2
-"""Of a clip's frames, the last ones."""
+"""Share of a clip's frames, the last ones, that reach the goal."""
 
 
 @dataclass(frozen=True)
-class ClipFrames:
-    """Frames of clips, as candidates of a selection."""
+class ClipPool:
+    """The M candidates of a selection: frames of clips."""
 
     embeddings: FloatArray
     """(M, D)."""
     starts: FloatArray
     """(M, D) x_0 of each."""
     clip: NDArray[np.intp]
-    """(M,) which clip each is of."""
+    """(M,) index of the clip that each is of."""
     satisfies: NDArray[np.bool_]
-    """(M,) which reach the goal."""
+    """(M,) whether it reaches the goal."""
 
     def scores(self, start: FloatArray, goal: FloatArray, features: Features, similarity: Similarity) -> Values:
         """Score by one start and one goal, (1, D) each: (M,) float64."""
@@ -51,13 +52,13 @@ class ClipFrames:
         return scores
 
 
-def enough(clips: Sequence[Clip], least: int) -> list[str]:
-    """Return the objects that have at least so many clips."""
-    things = dict.fromkeys(clip.thing for clip in clips)
-    return [thing for thing in things if sum(clip.thing == thing for clip in clips) >= least]
+def things_with(clips: Sequence[Clip], n_clips: int) -> list[str]:
+    """Return the objects that have at least `n_clips` clips."""
+    counts = Counter(clip.thing for clip in clips)
+    return [thing for thing, count in counts.items() if count >= n_clips]
 
 
-def candidates(
+def clip_pool(
     clips: Sequence[Clip],
     embeddings: Sequence[FloatArray],
     thing: str,
@@ -67,45 +68,45 @@ def candidates(
     same_context: bool = True,
     left_out: int | None = None,
     seed: int = 0,
-) -> ClipFrames:
-    """Take the frames of clips, but for the clip that specifies the goal.
+) -> ClipPool:
+    """Return the frames of all clips but the one that specifies the goal.
 
     Args:
-        clips: all of them; at least 2 are to remain.
-        embeddings: (n, D) of each.
+        clips: all of them; at least 2 must remain.
+        embeddings: (n, D) per clip.
         thing: the goal's object.
-        diverse: candidates of all objects, not of the goal's alone.
-        any_thing: the end of a clip of any object reaches the goal, as its action does, not of the goal's alone.
-        same_context: x_0 of a candidate's own clip, else of another candidate clip drawn with `seed`.
-        left_out: the clip that specifies the goal, when it is one of these.
+        diverse: take clips of all objects, not of the goal's alone.
+        any_thing: the end of a clip of any object counts as reaching the goal, not of the goal's alone.
+        same_context: take x_0 from a candidate's own clip, else from another one drawn with `seed`.
+        left_out: index of the clip that specifies the goal, if it is one of `clips`.
         seed: of that draw.
     """
-    pool = [i for i, clip in enumerate(clips) if i != left_out and (diverse or clip.thing == thing)]
-    contexts = np.arange(len(pool)) if same_context else selection.draw_others(len(pool), seed)
-    lengths = [len(embeddings[i]) for i in pool]
+    kept = [i for i, clip in enumerate(clips) if i != left_out and (diverse or clip.thing == thing)]
+    contexts = np.arange(len(kept)) if same_context else selection.draw_others(len(kept), seed)
+    lengths = [len(embeddings[i]) for i in kept]
     reached = [
         (np.arange(n) >= n - max(1, round(GOAL_SHARE * n))) & (any_thing or clips[i].thing == thing)
-        for i, n in zip(pool, lengths, strict=True)
+        for i, n in zip(kept, lengths, strict=True)
     ]
-    starts = [embeddings[pool[context]][:1] for context in contexts]
-    return ClipFrames(
-        np.concatenate([embeddings[i][1:] for i in pool]),
+    starts = [embeddings[kept[context]][:1] for context in contexts]
+    return ClipPool(
+        np.concatenate([embeddings[i][1:] for i in kept]),
         np.concatenate([np.repeat(start, n - 1, axis=0) for start, n in zip(starts, lengths, strict=True)]),
-        np.repeat(pool, np.array(lengths) - 1),
+        np.repeat(kept, np.array(lengths) - 1),
         np.concatenate([frames[1:] for frames in reached]),
     )
 
 
 @dataclass(frozen=True)
 class ObjectSelection:
-    """How well goals of one object are found; means over the clips that specified the goal in turn."""
+    """How well the goals of one object are selected; means over the clips that specify the goal in turn."""
 
     top_n_success: Estimate
     relative_variation: Estimate
     goal_frame_ratio: float
-    """Share of the candidates that are right: what picking at random finds."""
+    """Share of candidates that reach the goal: the success rate of a random choice."""
     top: int
-    """N of the Top-N success rate, where fewer candidates are right than were asked for."""
+    """N of the Top-N success rate, lowered where fewer candidates reach the goal."""
     n_goals: int
     n_clips: int
     """Of this object."""
@@ -118,18 +119,18 @@ class ObjectSelection:
 
 @dataclass(frozen=True)
 class ClipSelection:
-    """What goals and actions are found in real video."""
+    """How well goals or actions are selected in real video, per object."""
 
     objects: Mapping[str, ObjectSelection]
     left_out: tuple[str, ...]
-    """Objects that have too few clips."""
+    """Objects with too few clips."""
     n_clips: int
     embedder_sha256: str
 
     def mean(self) -> dict[str, float]:
-        """Return the means over objects, and how many times better than random the highest scores are."""
-        success = float(np.mean([judged.top_n_success.value for judged in self.objects.values()]))
-        chance = float(np.mean([judged.goal_frame_ratio for judged in self.objects.values()]))
+        """Return means over objects, and the ratio of the success rate to that of a random choice."""
+        success = float(np.mean([selected.top_n_success.value for selected in self.objects.values()]))
+        chance = float(np.mean([selected.goal_frame_ratio for selected in self.objects.values()]))
         return {"top_n_success": success, "goal_frame_ratio": chance, "times_random": success / chance}
 
 
@@ -152,19 +153,19 @@ def select_clips(
     device: str = "auto",
     on_progress: Callable[[int, int], None] | None = None,
 ) -> ClipSelection:
-    """Let clip after clip specify the goal by its first and last frame: do the highest scores find the end of a clip?
+    """Let each clip specify the goal by its first and last frame: do the highest scores find the ends of other clips?
 
     Args:
         folder: clips, as for `find_clips`.
-        goals: folder of other clips, which specify the goals; default those of `folder` in turn.
-        ask: goals: is the clip of the goal's object? actions: of any, as all do the same; takes the pool of all.
-        template: with Something-Something V2: the action.
+        goals: folder of other clips that specify the goals; default those of `folder` in turn.
+        ask: goals: ends of clips of the goal's object count; actions: of any object (give pool ``all``).
+        template: the action, with Something-Something V2.
         pool: candidates of the goal's object alone, or of all objects.
-        context: x_0 of a candidate: of its own clip, or of another one.
+        context: x_0 comes from the candidate's own clip or from another one.
         embedder: URI of the network.
         features: how frames and goals are compared.
         similarity: how frames and goals are compared.
-        top: N of the Top-N success rate; fewer where fewer candidates are right.
+        top: N of the Top-N success rate; lowered where fewer candidates reach the goal.
         n_frames: of each clip, evenly spaced.
         n_repeats: clips per object that specify the goal in turn.
         max_clips: per object, default all.
@@ -179,8 +180,8 @@ def select_clips(
     within = goal_folder.resolve() == folder.resolve()
     clips = find_clips(folder, template)
     goal_clips = clips if within else find_clips(goal_folder, template)
-    specified = {clip.thing for clip in goal_clips}
-    things = [thing for thing in enough(clips, 3 if within else 2) if thing in specified]
+    goal_things = {clip.thing for clip in goal_clips}
+    things = [thing for thing in things_with(clips, 3 if within else 2) if thing in goal_things]
     if not things:
         raise BadInput(f"no object has 2 clips in {folder} to choose from and 1 other in {goal_folder} for the goal")
     left_out = dict.fromkeys(clip.thing for clip in (*clips, *goal_clips) if clip.thing not in things)
@@ -199,9 +200,9 @@ def select_clips(
     objects = {}
     for thing in things:
         goal_indices = [i for i, clip in enumerate(goal_clips) if clip.thing == thing]
-        tops, variations, ratios, picked = [], [], [], []
+        successes, variations, ratios, tops = [], [], [], []
         for repeat, goal in enumerate(np.random.default_rng(0).permutation(goal_indices)[:n_repeats].tolist()):
-            frames = candidates(
+            candidates = clip_pool(
                 clips,
                 embeddings,
                 thing,
@@ -212,17 +213,17 @@ def select_clips(
                 seed=repeat,
             )
             start_and_goal = goal_embeddings[goal][:1], goal_embeddings[goal][-1:]
-            scores = frames.scores(*start_and_goal, features, similarity)
-            tops.append(selection.top_up_to(scores, frames.satisfies, top))
-            variations.append(selection.relative_variation(scores, frames.satisfies))
-            ratios.append(selection.goal_frame_ratio(frames.satisfies))
-            picked.append(min(top, int(frames.satisfies.sum())))
+            scores = candidates.scores(*start_and_goal, features, similarity)
+            successes.append(selection.top_up_to(scores, candidates.satisfies, top))
+            variations.append(selection.relative_variation(scores, candidates.satisfies))
+            ratios.append(selection.goal_frame_ratio(candidates.satisfies))
+            tops.append(min(top, int(candidates.satisfies.sum())))
         objects[thing] = ObjectSelection(
-            bootstrap([np.array(tops)]),
+            bootstrap([np.array(successes)]),
             bootstrap([np.array(variations)]),
             float(np.mean(ratios)),
-            min(picked),
-            len(tops),
+            min(tops),
+            len(successes),
             sum(clip.thing == thing for clip in clips),
         )
     return ClipSelection(objects, tuple(left_out), len(clips), network.fingerprint)

@@ -21,13 +21,13 @@ from zest_rl.types import FloatArray
 OPENING = "Opening [something]"
 OBJECTS = ("door", "drawer", "box", "fridge", "laptop", "washing machine", "oven")
 """The seven objects of the paper."""
-CALLED = {
+LABEL_PATTERNS = {
     "box": "box(es)?",
     "fridge": "(fridge|refrigerator)s?",
     "laptop": "laptops?( computers?)?",
     "oven": "(?<!microwave )ovens?",
 }
-"""What labels call an object, where it is not its name alone or with an s."""
+"""Regular expression for an object in a label, where it is not its name with an optional s."""
 VIDEOS = "20bn-something-something-v2"
 LABELS = tuple(
     f"{folder}{prefix}{part}.json"
@@ -35,7 +35,7 @@ LABELS = tuple(
     for prefix in ("something-something-v2-", "")
     for part in ("train", "validation")
 )
-"""Where the labels of its releases stand."""
+"""Paths of the labels in its releases."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Clip:
     path: Path
     """A video file, or a folder of pictures in the order of their names."""
     thing: str
-    """What is acted on."""
+    """The object that is acted on."""
 
 
 def find_clips(root: Path, template: str = OPENING) -> list[Clip]:
@@ -53,7 +53,7 @@ def find_clips(root: Path, template: str = OPENING) -> list[Clip]:
 
     Args:
         root: the folder.
-        template: the action; in a folder by object all clips are of it.
+        template: the action; a folder of clips by object has one action only.
 
     Raises:
         BadInput: there is none.
@@ -65,11 +65,11 @@ def something_something(root: Path, things: Sequence[str] = OBJECTS, template: s
     """Find the clips of one action on some objects in a folder laid out as Something-Something V2.
 
     The folder holds ``20bn-something-something-v2/ID.webm`` and one of `LABELS`, lists of ``{"id", "template",
-    "placeholders"}``. A clip is of what its first placeholder ends with: "a kitchen drawer" is a drawer, "the fridge
+    "placeholders"}``. A clip's object is the end of its first placeholder: "a kitchen drawer" is a drawer, "the fridge
     door" a fridge.
 
     Raises:
-        BadInput: the layout is another one, or no clip is found.
+        BadInput: the layout differs, or no clip is found.
     """
     files = [root / name for name in LABELS if (root / name).is_file()]
     if not files or not (root / VIDEOS).is_dir():
@@ -81,7 +81,7 @@ def something_something(root: Path, things: Sequence[str] = OBJECTS, template: s
             for entry in entries:
                 templates.add(entry["template"])
                 if entry["template"] == template:
-                    thing = _named(str(entry["placeholders"][0]).lower().strip(), things)
+                    thing = _object_of(str(entry["placeholders"][0]).lower().strip(), things)
                     path = root / VIDEOS / f"{entry['id']}.webm"
                     if thing is not None and path.is_file():
                         clips.append(Clip(path, thing))
@@ -94,18 +94,18 @@ def something_something(root: Path, things: Sequence[str] = OBJECTS, template: s
     return clips
 
 
-def _named(words: str, things: Sequence[str]) -> str | None:
-    """Return which thing a label names, if any."""
+def _object_of(label: str, things: Sequence[str]) -> str | None:
+    """Return the object that a label names, if any."""
 
-    def ends(text: str) -> str | None:
-        called = {thing: CALLED.get(thing, f"{re.escape(thing)}s?") for thing in things}
-        return next((thing for thing, name in called.items() if re.search(rf"\b({name})$", text)), None)
+    def at_end(text: str) -> str | None:
+        patterns = {thing: LABEL_PATTERNS.get(thing, f"{re.escape(thing)}s?") for thing in things}
+        return next((thing for thing, pattern in patterns.items() if re.search(rf"\b({pattern})$", text)), None)
 
-    return ends(re.sub(r"\s+doors?$", "", words)) or ends(words)
+    return at_end(re.sub(r"\s+doors?$", "", label)) or at_end(label)
 
 
 def folder_of_clips(root: Path) -> list[Clip]:
-    """Find clips that are sorted by object: ``ROOT/OBJECT/CLIP.mp4``, or ``ROOT/OBJECT/CLIP/`` with pictures.
+    """Find clips sorted by object: ``ROOT/OBJECT/CLIP.mp4``, or ``ROOT/OBJECT/CLIP/`` with pictures.
 
     Raises:
         BadInput: there is none.
@@ -132,10 +132,10 @@ def _visible(folder: Path) -> list[Path]:
 def embed_clips(
     clips: Sequence[Clip], embedder: Embedder, n_frames: int, on_done: Callable[[], object] = lambda: None
 ) -> list[FloatArray]:
-    """Embed clips, each once: what was embedded is kept in the cache, by content.
+    """Embed clips, each once: embeddings are cached by content.
 
     Args:
-        clips: what to embed.
+        clips: to be embedded.
         embedder: the network.
         n_frames: of each clip.
         on_done: called after each clip.

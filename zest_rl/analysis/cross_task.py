@@ -1,4 +1,4 @@
-"""Several relabeled datasets → what the rewards of each are worth, and which task each goal scores highest."""
+"""Several relabeled datasets → the inspection of each, and which task's episodes each goal scores highest."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from zest_rl.types import FloatArray
 
 @dataclass(frozen=True)
 class Confusion:
-    """Where the episodes of each source end, by the goal of each dataset."""
+    """Scores of the last frames of each source's episodes, by the goal of each dataset."""
 
     sources: Mapping[tuple[str, str], str]
-    """Id and sha256 of what was relabeled → its task; one row each, however often one was relabeled."""
+    """Id and sha256 of each relabeled dataset → its task; one row each, however often it was relabeled."""
     own_rows: tuple[int, ...]
-    """The row of each dataset's own episodes."""
+    """Per dataset, the row of its episodes."""
     means: FloatArray
     """Mean score (n_sources, n_datasets) float32."""
     low: FloatArray
@@ -35,7 +35,7 @@ class Confusion:
     """Upper ends."""
 
     def row_names(self) -> tuple[str, ...]:
-        """Name each row by its task; sources of the same task by their ids, too, and if need be by their hashes."""
+        """Name each row by its task; add the ids where tasks are equal, and the hashes where ids are equal."""
         tasks, ids, names = list(self.sources.values()), [source for source, _ in self.sources], []
         for (source, sha256), task in self.sources.items():
             place = f"{source}, {sha256[:8]}" if ids.count(source) > 1 else source
@@ -46,18 +46,18 @@ class Confusion:
 def confusion(
     inspections: Sequence[Inspection], *, n_workers: int | None = None, on_done: Callable[[], object] = lambda: None
 ) -> Confusion:
-    """Score where the episodes of all end by the goal of each.
+    """Score the last frames of all datasets' episodes by the goal of each.
 
-    Episodes are seen from the views of their own task, whatever the goal is of. A goal that is worth something scores
-    those of its own task highest. Needs no ground truth.
+    Episodes are rendered from the views of their own task, whatever the goal's. A useful goal scores the episodes of
+    its own task highest. Needs no ground truth.
 
     Args:
-        inspections: of datasets of several tasks.
+        inspections: of kitchen datasets of several tasks.
         n_workers: processes that embed, default one per core.
         on_done: called after each goal.
 
     Raises:
-        ZestError: a scorer is gone, or was made with another embedder or renderer than the ones here.
+        ZestError: a scorer is missing, or was made with another embedder or renderer than those installed.
     """
     by_source = {_source(inspection): inspection for inspection in inspections}
     ends = []
@@ -66,8 +66,8 @@ def confusion(
             raise BadInput(f"the frames of {inspection.dataset_id} are not rendered from kitchen states")
         ends.append(np.stack([episode[[0, -1]] for episode in inspection.states], axis=1))
     estimates = np.empty((3, len(by_source), len(inspections)), dtype=np.float32)
-    for column, goal_of in enumerate(inspections):
-        goal = StateScorer.load(dataset_path(goal_of.dataset_id) / SCORER_FILE, n_workers=n_workers)
+    for column, inspection in enumerate(inspections):
+        goal = StateScorer.load(dataset_path(inspection.dataset_id) / SCORER_FILE, n_workers=n_workers)
         for row, ((first, last), source) in enumerate(zip(ends, by_source.values(), strict=True)):
             scores = goal.seen_as(source.task).score_pairs(first, last).astype(np.float64)
             mean = bootstrap([scores], n_resamples=1000)
@@ -83,19 +83,19 @@ def _source(inspection: Inspection) -> tuple[str, str]:
 
 
 def confusion_warnings(inspections: Sequence[Inspection], compared: Confusion) -> dict[str, str]:
-    """Find the goals that score another task's episodes higher than their own, or all alike: dataset → sentence."""
+    """Return sentences on goals that score another task's episodes higher than their own, or all alike, by dataset."""
     tasks, warnings = list(compared.sources.values()), {}
-    for column, (goal_of, own) in enumerate(zip(inspections, compared.own_rows, strict=True)):
+    for column, (inspection, own_row) in enumerate(zip(inspections, compared.own_rows, strict=True)):
         means, low, high = compared.means[:, column], compared.low[:, column], compared.high[:, column]
-        others = [row for row, task in enumerate(tasks) if task != goal_of.task]
+        others = [row for row, task in enumerate(tasks) if task != inspection.task]
         best = max(others, key=means.__getitem__)
-        if means[best] > means[own]:
-            warnings[goal_of.dataset_id] = (
+        if means[best] > means[own_row]:
+            warnings[inspection.dataset_id] = (
                 f"Its goal scores the episodes of {compared.row_names()[best]} higher ({means[best]:.2f}) than its own "
-                f"({means[own]:.2f})."
+                f"({means[own_row]:.2f})."
             )
-        elif (high[others] >= low[own]).all():
-            warnings[goal_of.dataset_id] = (
+        elif (high[others] >= low[own_row]).all():
+            warnings[inspection.dataset_id] = (
                 f"Its goal scores the episodes of every task alike ({means.min():.2f} to {means.max():.2f}): it does "
                 "not tell its own from the others."
             )
@@ -104,26 +104,23 @@ def confusion_warnings(inspections: Sequence[Inspection], compared: Confusion) -
 
 @dataclass(frozen=True)
 class JointInspection:
-    """Datasets that were inspected one by one, and against each other where they are of several tasks."""
+    """Inspections of several datasets, and their comparison where they are of several tasks."""
 
     inspections: tuple[Inspection, ...]
     views: Mapping[str, Mapping[str, EpisodeView]]
-    """The best and the worst episode by dataset; none where they cannot be shown."""
+    """The best and the worst episode by dataset; empty where they cannot be rendered."""
     confusion: Confusion | None
-    """None where all datasets are of one task, or goals could not be compared across tasks."""
+    """None where all datasets are of one task, or the goals could not be compared."""
     warnings: Mapping[str, tuple[str, ...]]
-    """What speaks against training on the rewards, by dataset."""
+    """Sentences that speak against training on the rewards, by dataset."""
     left_out: tuple[str, ...]
-    """Sentences that say what could not be shown or compared, and why."""
+    """Sentences on what could not be rendered or compared, and why."""
 
     def to_json(self) -> dict[str, Any]:
-        """What `zest inspect --json` prints."""
+        """Return the output of `zest inspect --json`."""
         return {
             "datasets": {
-                inspection.dataset_id: {
-                    "label": label,
-                    "figures": _figures_to_json(inspection),
-                }
+                inspection.dataset_id: {"label": label, "figures": _figures_to_json(inspection)}
                 for label, inspection in zip(labels(self.inspections), self.inspections, strict=True)
             },
             "warnings": {dataset: list(sentences) for dataset, sentences in self.warnings.items()},
@@ -139,19 +136,18 @@ class JointInspection:
 
 
 def _figures_to_json(inspection: Inspection) -> dict[str, Any]:
-    known = {
-        figure.label: inspection.known_figures()[figure.key] for figure in FIGURES if figure.key in inspection.figures
-    }
-    return {label: None if estimate is None else estimate.as_json() for label, estimate in known.items()}
+    estimates = inspection.known_figures()
+    known = [(figure.label, estimates[figure.key]) for figure in FIGURES if figure.key in estimates]
+    return {label: None if estimate is None else estimate.as_json() for label, estimate in known}
 
 
 def inspect_datasets(
     datasets: Sequence[str], *, n_workers: int | None = None, on_progress: Callable[[int, int], None] | None = None
 ) -> JointInspection:
-    """Judge the rewards of relabeled datasets, and with several tasks also which task each goal scores highest.
+    """Inspect relabeled datasets and, where they are of several tasks, compare their goals across the tasks.
 
     Args:
-        datasets: ids; one that is given twice counts once.
+        datasets: ids; duplicates are ignored.
         n_workers: processes that embed, default one per core.
         on_progress: called with (parts done, parts in all).
 

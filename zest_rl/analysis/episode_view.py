@@ -1,4 +1,4 @@
-"""One episode → what a person looks at: a strip of frames with their scores, and each view's."""
+"""One kitchen episode → frames for people to look at, with the scores of all views and of each."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ N_FRAMES = 8
 
 @dataclass(frozen=True)
 class EpisodeView:
-    """What the scorer sees of one episode; frames and scores are made when they are first asked for."""
+    """The frames and scores of one episode, computed when first used."""
 
     scorer: StateScorer
     """Of the dataset."""
@@ -31,7 +31,7 @@ class EpisodeView:
 
     @cached_property
     def steps(self) -> NDArray[np.intp]:
-        """(n,) which steps `frames` shows, evenly spaced over the episode."""
+        """(n,) steps of `frames`, evenly spaced over the episode."""
         return evenly_spaced(len(self.states), N_FRAMES)
 
     @cached_property
@@ -47,7 +47,7 @@ class EpisodeView:
 
     @cached_property
     def by_view(self) -> FloatArray:
-        """(V, T+1), each view's own."""
+        """(V, T+1) of each view alone."""
         return self.scorer.by_view(self.states)
 
     @cached_property
@@ -58,23 +58,23 @@ class EpisodeView:
         return np.array([np.abs(frame - first).mean() for frame in frames], dtype=np.float32)[index]
 
     def _render(self, states: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-        """Render each distinct state once: (U, V, H, W, 3), and which of them each state is."""
+        """Render each distinct state once: frames (U, V, H, W, 3), and the index of each state's frame (T+1,)."""
         views = self.scorer.embedder.views
         distinct, index = np.unique(canonical_states(states, views), axis=0, return_inverse=True)
         return np.stack([views.shared_renderer().render(state) for state in distinct]), index.reshape(-1)
 
 
 def best_and_worst(inspection: Inspection, *, n_workers: int | None = None) -> dict[str, EpisodeView]:
-    """Return views of the episodes with the highest and the lowest return: "best" and "worst".
+    """Return the episodes with the highest and the lowest return, as "best" and "worst".
 
-    Empty where scores were shuffled, or where frames were not rendered from kitchen states.
+    Empty where scores were shuffled, or frames were not rendered from kitchen states.
 
     Args:
         inspection: of a dataset.
         n_workers: processes that embed, default one per core.
 
     Raises:
-        ZestError: the scorer is gone, or was made with another embedder or renderer than the ones here.
+        ZestError: the scorer is missing, or was made with another embedder or renderer than those installed.
     """
     if inspection.made.shuffle is not None or inspection.states is None:
         return {}

@@ -1,4 +1,4 @@
-"""Datasets → candidates of goal and action selection, scored by one goal, judged by `zest_rl.metrics.selection`."""
+"""Datasets → frames scored by one goal, for goal and action selection as judged by `zest_rl.metrics.selection`."""
 
 from __future__ import annotations
 
@@ -26,32 +26,35 @@ Context = Literal["same", "different"]
 
 
 @dataclass(frozen=True)
-class Candidates:
-    """Frames of one or several datasets (the paper's SD and DD) and what is asked of them."""
+class FramePool:
+    """The M candidates of a selection: frames of one or several datasets (the paper's SD and DD)."""
 
     states: NDArray[np.float64]
     """(M, nq) simulator positions."""
     trajectory: NDArray[np.intp]
-    """(M,) which trajectory each is of."""
+    """(M,) trajectory that each frame is of."""
     task: tuple[str, ...]
-    """What the robot was doing, per trajectory."""
+    """Kitchen task per trajectory."""
     starts: NDArray[np.float64]
-    """(trajectories, nq) their first states."""
+    """(trajectories, nq) first states."""
 
     def satisfies(self, task: Task) -> NDArray[np.bool_]:
-        """Which frames show `task` done, whatever the robot was doing: (M,) bool. Ground truth, for judging."""
+        """Return which frames show `task` done, whatever their trajectory's task: (M,) bool. Ground truth."""
         return np.asarray(progress_of(task, self.states) >= SUCCESS_PROGRESS)
 
     def does(self, task: Task) -> NDArray[np.bool_]:
-        """Which frames show the action of `task` done to whatever their trajectory is about: (M,) bool."""
+        """Return which frames show the action of `task` done to the object of their own trajectory: (M,) bool."""
         done = np.zeros(len(self.states), dtype=bool)
         for other in {name for name in self.task if TASKS[name].action == task.action}:
-            of_other = np.array([name == other for name in self.task])[self.trajectory]
-            done |= of_other & self.satisfies(TASKS[other])
+            done |= self.is_of(other) & self.satisfies(TASKS[other])
         return done
 
+    def is_of(self, task: str) -> NDArray[np.bool_]:
+        """Return which frames are of a trajectory of `task`: (M,) bool."""
+        return np.array([name == task for name in self.task])[self.trajectory]
+
     def start_alike(self, views: Views) -> bool:
-        """Whether all trajectories start with the same picture, as without the robot in view."""
+        """Whether all trajectories start with the same picture, as they do without the robot in view."""
         return len(np.unique(canonical_states(self.starts, views), axis=0)) == 1
 
     def contexts(self, context: Context, seed: int) -> NDArray[np.float64]:
@@ -69,8 +72,8 @@ class Candidates:
         return np.asarray(self.starts[selection.draw_others(len(self.starts), seed)[self.trajectory]])
 
 
-def draw_candidates(dataset_ids: Sequence[str], n_frames: int, seed: int = 0) -> Candidates:
-    """Draw frames evenly from datasets, x_0 left out.
+def draw_pool(dataset_ids: Sequence[str], n_frames: int, seed: int = 0) -> FramePool:
+    """Draw frames uniformly from datasets, without first frames.
 
     Args:
         dataset_ids: kitchen datasets; one for a narrow pool, several tasks for a diverse one.
@@ -78,7 +81,7 @@ def draw_candidates(dataset_ids: Sequence[str], n_frames: int, seed: int = 0) ->
         seed: of the draw.
 
     Raises:
-        BadInput: no dataset, none of that name, or `n_frames` is below 1.
+        BadInput: no dataset, one twice, an unknown one, or `n_frames` is below 1.
     """
     if not dataset_ids or n_frames < 1 or len(set(dataset_ids)) < len(dataset_ids):
         raise BadInput(
@@ -100,11 +103,11 @@ def draw_candidates(dataset_ids: Sequence[str], n_frames: int, seed: int = 0) ->
             trajectory.append(len(starts) + i)
         starts += [episode[0] for episode in episodes]
         tasks += [name] * len(episodes)
-    return Candidates(np.stack(states), np.array(trajectory, dtype=np.intp), tuple(tasks), np.stack(starts))
+    return FramePool(np.stack(states), np.array(trajectory, dtype=np.intp), tuple(tasks), np.stack(starts))
 
 
 def draw_goals(scorer: StateScorer, n_goals: int | None, seed: int) -> StateScorer:
-    """Return a scorer with `n_goals` of the goals, drawn with `seed`; with all of them for None.
+    """Return a scorer with `n_goals` of the goal's pictures, drawn with `seed`; with all of them for None.
 
     Raises:
         BadInput: there are fewer.
@@ -117,24 +120,27 @@ def draw_goals(scorer: StateScorer, n_goals: int | None, seed: int) -> StateScor
     return scorer.with_goals(np.sort(np.random.default_rng(seed).permutation(n)[:n_goals]))
 
 
-def score_as_goals(
-    candidates: Candidates,
+def score_pool(
+    pool: FramePool,
     config: ScorerConfig,
     views: Views,
     *,
+    ask: Literal["goals", "actions"] = "goals",
     context: Context = "same",
     n_repeats: int = 1,
     n_goals: int | None = None,
     n_workers: int | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> NDArray[np.float64]:
-    """Score candidates by how much they look like the goal, all seen from the views of the goal's task.
+    """Score candidates by a goal.
 
     Args:
-        candidates: M of them.
-        config: the goal, and how it is compared.
+        pool: M candidates.
+        config: the goal, and how frames are compared with it.
         views: of the goal's task.
-        context: where x_0 comes from.
+        ask: goals: how much does a frame look like the goal, seen from the views of the goal's task? actions: does its
+            trajectory change its own object as the goal changes the goal's, seen from the views of the own task?
+        context: where x_0 comes from; actions need ``same``.
         n_repeats: R, over which goals and contexts are drawn anew.
         n_goals: pictures of the goal per repeat, default all.
         n_workers: processes that embed, default one per core.
@@ -143,68 +149,34 @@ def score_as_goals(
     Returns:
         (R, M) float64.
     """
-    whole = StateScorer.build(config, views, candidates.starts[0], n_workers=n_workers)
-    rows = []
-    for repeat in range(n_repeats):
-        scorer = draw_goals(whole, n_goals, repeat)
-        rows.append(scorer.score_pairs(candidates.contexts(context, repeat), candidates.states, on_progress))
-    return np.stack(rows).astype(np.float64)
-
-
-def score_as_actions(
-    candidates: Candidates,
-    config: ScorerConfig,
-    views: Views,
-    *,
-    n_repeats: int = 1,
-    n_goals: int | None = None,
-    n_workers: int | None = None,
-    on_progress: Callable[[int, int], None] | None = None,
-) -> NDArray[np.float64]:
-    """Score candidates by how much they change what their own trajectory is about as the goal changes its object.
-
-    Each trajectory is seen from the views of its own task, so that the change is in the picture.
-
-    Args:
-        candidates: M of them, of several tasks.
-        config: the goal, and how it is compared.
-        views: of the goal's task.
-        n_repeats: R, over which goals are drawn anew.
-        n_goals: pictures of the goal per repeat, default all.
-        n_workers: processes that embed, default one per core.
-        on_progress: called with (parts embedded, parts in all).
-
-    Returns:
-        (R, M) float64.
-    """
-    goal = StateScorer.build(config, views, candidates.starts[0], n_workers=n_workers)
-    first = candidates.contexts("same", 0)
-    scores = np.empty((n_repeats, len(candidates.states)))
-    for name in sorted(set(candidates.task)):
-        whole = goal.seen_as(name)
-        frames = np.flatnonzero(np.array([task == name for task in candidates.task])[candidates.trajectory])
+    goal = StateScorer.build(config, views, pool.starts[0], n_workers=n_workers)
+    by_task = [(goal, np.arange(len(pool.states)))]
+    if ask == "actions":
+        by_task = [(goal.seen_as(name), np.flatnonzero(pool.is_of(name))) for name in sorted(set(pool.task))]
+    scores = np.empty((n_repeats, len(pool.states)))
+    for whole, frames in by_task:
         for repeat in range(n_repeats):
-            scorer = draw_goals(whole, n_goals, repeat)
-            scores[repeat, frames] = scorer.score_pairs(first[frames], candidates.states[frames], on_progress)
+            scorer, starts = draw_goals(whole, n_goals, repeat), pool.contexts(context, repeat)
+            scores[repeat, frames] = scorer.score_pairs(starts[frames], pool.states[frames], on_progress)
     return scores
 
 
 @dataclass(frozen=True)
 class FrameSelection:
-    """The scores of candidates by one goal, and which of them reach it."""
+    """The scores of M candidates by one goal, and which of them satisfy it."""
 
     task: str
-    """What the goal is of."""
+    """Of the goal."""
     top: int
     """N of the Top-N success rate."""
     scores: NDArray[np.float64]
-    """(R, M) of each candidate in each repeat."""
+    """(R, M) over R repeats."""
     satisfies: NDArray[np.bool_]
-    """(M,) which candidates are right. Ground truth."""
+    """(M,) Ground truth."""
     trajectory: NDArray[np.intp]
-    """(M,) which trajectory each is of."""
+    """(M,) trajectory that each candidate is of."""
     starts_are_alike: bool
-    """Whether all trajectories start with the same picture, so that it makes no difference whose x_0 is taken."""
+    """Whether all trajectories start with the same picture, so that their contexts are equal."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the measures of `zest_rl.metrics.selection` with 95 % intervals over trajectories, and the counts."""
@@ -252,53 +224,53 @@ def select_frames(
     n_workers: int | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> FrameSelection:
-    """Draw frames of kitchen datasets and score them by a goal: do the highest scores find what the goal asks for?
+    """Draw frames of kitchen datasets and score them by a goal: do the highest scores satisfy it?
 
     Args:
-        datasets: whose frames are the candidates: one (the paper's narrow pool) or several tasks (diverse).
-        ask: goals: is the goal reached (Cui et al. §4.1)? actions: is its action done, to whatever object (§4.2)?
-        task: what the goal is of; default the task of the first dataset.
+        datasets: ids: one (the paper's narrow pool) or of several tasks (diverse).
+        ask: goals: is the goal reached (Cui et al. §4.1)? actions: is its action done, to any object (§4.2)?
+        task: of the goal; default that of the first dataset.
         goal: as in `zest_rl.rewards.goals`.
         embedder: URI of the network.
         features: how frames and goals are compared.
         similarity: how frames and goals are compared.
         views: cameras around the object.
         show_robot: keep the robot in view.
-        tolerance: rad or m, below which states are embedded once.
+        tolerance: rad or m; states that differ by less are embedded once.
         context: goals only: where x_0 of a candidate comes from.
         top: N of the Top-N success rate.
         n_frames: candidates drawn from each dataset.
         n_goals: pictures of the goal drawn per repeat, default all.
-        n_repeats: R; 1 when nothing is drawn anew.
+        n_repeats: R; 1 is enough when nothing is drawn.
         seed: of the candidates.
         precision: of the embedder.
         n_workers: processes that embed, default one per core.
         on_progress: called with (parts embedded, parts in all).
 
     Raises:
-        BadInput: an argument is out of range, or fewer than `top` candidates are right.
+        BadInput: an argument is out of range, or fewer than `top` candidates satisfy the goal.
     """
     if not datasets:
         raise BadInput("a selection needs at least 1 dataset; `zest collect` makes them")
-    candidates = draw_candidates(datasets, n_frames, seed)
-    wanted = get_task(task or candidates.task[0])
-    satisfies = candidates.satisfies(wanted) if ask == "goals" else candidates.does(wanted)
+    pool = draw_pool(datasets, n_frames, seed)
+    goal_task = get_task(task or pool.task[0])
+    satisfies = pool.satisfies(goal_task) if ask == "goals" else pool.does(goal_task)
     if satisfies.sum() < top:
         raise BadInput(
-            f"only {satisfies.sum()} of {len(satisfies)} candidates satisfy the goal of {wanted.name!r}, so the "
+            f"only {satisfies.sum()} of {len(satisfies)} candidates satisfy the goal of {goal_task.name!r}, so the "
             f"highest {top} could not all; give more --n-frames, a smaller --top, or a dataset with more successes"
         )
-    seen_from = Views(wanted.name, views, robot=show_robot, tolerance=tolerance)
+    cameras = Views(goal_task.name, views, robot=show_robot, tolerance=tolerance)
     config = ScorerConfig(goal, embedder, features, similarity, precision)
-    options: dict[str, Any] = {
-        "n_repeats": 1 if n_goals is None and context == "same" else n_repeats,
-        "n_goals": n_goals,
-        "n_workers": n_workers,
-        "on_progress": on_progress,
-    }
-    if ask == "goals":
-        scores = score_as_goals(candidates, config, seen_from, context=context, **options)
-    else:
-        scores = score_as_actions(candidates, config, seen_from, **options)
-    alike = candidates.start_alike(seen_from)
-    return FrameSelection(wanted.name, top, scores, satisfies, candidates.trajectory, alike)
+    scores = score_pool(
+        pool,
+        config,
+        cameras,
+        ask=ask,
+        context=context if ask == "goals" else "same",
+        n_repeats=1 if n_goals is None and context == "same" else n_repeats,
+        n_goals=n_goals,
+        n_workers=n_workers,
+        on_progress=on_progress,
+    )
+    return FrameSelection(goal_task.name, top, scores, satisfies, pool.trajectory, pool.start_alike(cameras))

@@ -1,4 +1,4 @@
-"""Relabeled datasets → what their rewards are worth before anything is trained on them. Reads ground truth, if any."""
+"""Relabeled datasets → figures that judge their rewards before training. Reads ground truth, if there is any."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.analysis.reward_figures import measure, true_returns, warnings
+from zest_rl.analysis.reward_figures import measure_rewards, reward_warnings, true_returns
 from zest_rl.data.provenance import RelabelRecord
 from zest_rl.data.reader import open_dataset
 from zest_rl.errors import BadInput
@@ -22,11 +22,11 @@ from zest_rl.types import FloatArray, GroundTruth
 
 @dataclass(frozen=True)
 class Inspection:
-    """What can be said of one dataset's rewards."""
+    """The figures and warnings of one dataset's rewards."""
 
     dataset_id: str
     task: str
-    """Of the kitchen; of another robot, the dataset that was relabeled."""
+    """Kitchen task; of another robot, the id of the dataset that was relabeled."""
     made: RelabelRecord
     """How it was relabeled."""
     figures: Mapping[str, Estimate]
@@ -35,16 +35,16 @@ class Inspection:
     over_time: Mapping[str, FloatArray]
     """Mean reward at each step (T,), of successes and failures; without ground truth, of all episodes."""
     returns: NDArray[np.float64]
-    """(N,) by the rewards."""
+    """(N,) sums of the rewards."""
     true_returns: NDArray[np.float64] | None
     """(N,); None without ground truth."""
     score_range: tuple[float, float]
     """The lowest and the highest score of any frame."""
     states: list[NDArray[np.float64]] | None
-    """(T+1, nq) simulator positions per episode; None of other robots than the kitchen's."""
+    """(T+1, nq) simulator positions per episode; None outside the kitchen."""
 
     def known_figures(self) -> dict[str, Estimate | None]:
-        """Every figure that was measured, by key; None where it is undefined, as for constant scores."""
+        """Return the figures by key, None where one is undefined, as for constant scores."""
         return {key: None if np.isnan(estimate.value) else estimate for key, estimate in self.figures.items()}
 
 
@@ -52,7 +52,7 @@ def inspect(dataset_id: str) -> Inspection:
     """Judge the rewards of a relabeled dataset.
 
     Raises:
-        BadInput: no such dataset, it was not relabeled, or it has fewer than 3 episodes.
+        BadInput: there is no such dataset, it was not relabeled, or it has fewer than 3 episodes.
     """
     with open_dataset(dataset_id) as ds:
         made = ds.record.relabel
@@ -76,16 +76,16 @@ def inspect(dataset_id: str) -> Inspection:
         still = [(episode[1:] == episode[0]).all(axis=1) for episode in rendered]
     elif (made.scorer.features, made.scorer.similarity) == ("delta", "cos") and made.shuffle is None:
         still = [episode == 0 for episode in after_actions]  # nothing else scores exactly 0
-    figures = measure(rewards, after_actions, frames, still, truth)
-    sentences = warnings(rewards, figures)
+    figures = measure_rewards(rewards, after_actions, frames, still, truth)
+    warnings = reward_warnings(rewards, figures)
     if made.shuffle is not None:
-        sentences.insert(0, "These are the scores of other episodes: the dataset was relabeled with --shuffle.")
+        warnings.insert(0, "These are the scores of other episodes: the dataset was relabeled with --shuffle.")
     return Inspection(
         dataset_id,
         made.source if views is None else views.task,
         made,
         figures,
-        tuple(sentences),
+        tuple(warnings),
         _over_time(rewards, truth),
         returns_of(rewards),
         None if truth is None else true_returns(truth),
@@ -99,14 +99,14 @@ def _over_time(rewards: list[FloatArray], truth: list[GroundTruth] | None) -> di
     if truth is not None:
         outcomes = list(zip(truth, rewards, strict=True))
         groups = {
-            "successes": [of_episode for episode, of_episode in outcomes if episode.success],
-            "failures": [of_episode for episode, of_episode in outcomes if not episode.success],
+            "successes": [curve for episode, curve in outcomes if episode.success],
+            "failures": [curve for episode, curve in outcomes if not episode.success],
         }
     return {name: _mean_by_step(group) for name, group in groups.items() if group}
 
 
 def _mean_by_step(rewards: Sequence[FloatArray]) -> FloatArray:
-    """Mean at each step over the episodes that last so long: (T of the longest,)."""
+    """Return the mean at each step over the episodes that reach it: (T of the longest,)."""
     total, count = np.zeros(max(map(len, rewards))), np.zeros(max(map(len, rewards)))
     for episode in rewards:
         total[: len(episode)] += episode
@@ -115,7 +115,7 @@ def _mean_by_step(rewards: Sequence[FloatArray]) -> FloatArray:
 
 
 def labels(inspections: Sequence[Inspection]) -> list[str]:
-    """Name each by its task and goal, and by the settings that differ among datasets of the same task and goal."""
+    """Name each by task and goal, and by the settings that differ among those of the same task and goal."""
     names = names_with_settings([(f"{each.task} by {_goal(each)}", _settings(each)) for each in inspections])
     return [
         f"{name} ({each.dataset_id})" if names.count(name) > 1 else name
@@ -139,7 +139,7 @@ def _goal(inspection: Inspection) -> str:
 
 
 def _settings(inspection: Inspection) -> dict[str, Any]:
-    """What can tell two rewards of one task and goal apart, by the words of a label."""
+    """Return the settings in which rewards of one task and goal may differ, by their name in a label."""
     made, scorer = inspection.made, inspection.made.scorer
     return {
         "embedder": scorer.embedder,

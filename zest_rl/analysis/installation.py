@@ -1,4 +1,4 @@
-"""Is everything here that the package needs, and how to fix what is not."""
+"""Checks of the installation: what the package needs, whether it is there, and how to fix it."""
 
 from __future__ import annotations
 
@@ -22,40 +22,40 @@ LITTLE_DISK, TOO_LITTLE_DISK = 2 * 2**30, 200 * 2**20
 
 @dataclass(frozen=True)
 class Check:
-    """The outcome of one check."""
+    """The result of one check."""
 
     name: str
     status: Literal["ok", "warn", "fail"]
-    """``warn``: works, but slower or with less; ``fail``: some verb cannot work."""
+    """``warn``: works, but slowly or partly; ``fail``: some verb cannot work."""
     detail: str
-    """What was found."""
+    """What the check saw."""
     fix: str = ""
     """What to do about it; empty when the status is ``ok``."""
 
 
 def check_installation(on_done: Callable[[], object] = lambda: None) -> list[Check]:
-    """Run all of `CHECKS`; one that breaks is a failure like the others.
+    """Run all of `CHECKS`; an exception in one is a failure with the fix of `FIXES`.
 
     Args:
         on_done: called after each.
     """
-    outcomes: list[Check] = []
+    results: list[Check] = []
     for name, check in CHECKS.items():
         try:
-            outcomes += check()
-        except Exception as error:  # whatever goes wrong in a check is its finding
-            outcomes.append(Check(name, "fail", f"{type(error).__name__}: {error}", FIXES[name]))
+            results += check()
+        except Exception as error:  # any error of a check is its result
+            results.append(Check(name, "fail", f"{type(error).__name__}: {error}", FIXES[name]))
         on_done()
-    return outcomes
+    return results
 
 
 def check_python() -> Iterator[Check]:
-    """Name the interpreter; the package's metadata keep pip from installing it on one that is too old."""
+    """Name the interpreter; pip refuses one that is too old."""
     yield Check("python", "ok", f"{platform.python_version()} ({sys.executable})")
 
 
 def check_packages() -> Iterator[Check]:
-    """Compare the installed versions with those that the package's metadata ask for."""
+    """Compare the installed versions with those that the package requires."""
     from packaging.requirements import Requirement
 
     required = [Requirement(text) for text in importlib.metadata.requires("zest-rl") or []]
@@ -78,7 +78,7 @@ def check_packages() -> Iterator[Check]:
 
 
 def check_disk() -> Iterator[Check]:
-    """Look at the disks that hold the cache and the datasets: can they be written to, and how much is free."""
+    """Check that the folders of the cache and the datasets can be written to and have space."""
     from zest_rl.data.reader import datasets_root
     from zest_rl.runtime.artifacts import cache_dir
 
@@ -105,7 +105,7 @@ def check_folder(name: str, folder: Path, variable: str) -> Check:
 
 
 def check_rendering() -> Iterator[Check]:
-    """Render a frame of the kitchen, in a process of its own: a broken GL driver takes its process along."""
+    """Render a frame of the kitchen in a separate process, which a broken GL driver would kill."""
     code = "from zest_rl.kitchen.scene import gl_backend; print(gl_backend())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     if done.returncode == 0:
@@ -116,7 +116,7 @@ def check_rendering() -> Iterator[Check]:
 
 
 def check_weights() -> Iterator[Check]:
-    """Compare the installed weights with the sha256 that they were published with, then embed a frame."""
+    """Compare the installed weights with their published sha256, then embed a frame."""
     import numpy as np
 
     from zest_rl.embedders import DEFAULT_EMBEDDER, load_embedder
@@ -133,7 +133,7 @@ def check_weights() -> Iterator[Check]:
 
 
 def check_processor() -> Iterator[Check]:
-    """Tell which arithmetic makes embedding and training fast here: bf16 on the CPU, CUDA."""
+    """Report what speeds up embedding and training on this machine: bf16 on the CPU, CUDA."""
     import torch
 
     flags = Path("/proc/cpuinfo")
@@ -144,7 +144,7 @@ def check_processor() -> Iterator[Check]:
 
 
 def check_ffmpeg() -> Iterator[Check]:
-    """Look for the ffmpeg that writes and reads videos."""
+    """Report the ffmpeg that writes and reads videos."""
     import imageio_ffmpeg
 
     yield Check("ffmpeg", "ok", imageio_ffmpeg.get_ffmpeg_version())
@@ -169,4 +169,4 @@ FIXES: dict[str, str] = {
     "processor": "reinstall torch",
     "ffmpeg": "pip install --force-reinstall --no-deps imageio-ffmpeg",
 }
-"""What to do when a check itself breaks."""
+"""What to do when a check raises an exception."""

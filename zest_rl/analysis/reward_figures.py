@@ -1,4 +1,4 @@
-"""The figures that judge the rewards of a dataset, and sentences that warn of bad ones. Ground truth only judges."""
+"""Figures that judge the rewards of a dataset, and warnings of bad ones. Ground truth judges, it makes no reward."""
 
 from __future__ import annotations
 
@@ -13,56 +13,56 @@ from zest_rl.metrics.statistics import Estimate
 from zest_rl.types import FloatArray, GroundTruth
 
 CLOCK, STRAIGHT, SATURATED, STILL, CONTRADICTORY = 0.95, 0.9, 0.95, 0.9, 0.01
-"""From these shares on a warning is given."""
+"""Shares from which on a warning is given."""
 FLAT = 1e-5
-"""Scores whose range is at most this share of the largest are constant, whatever rounding makes of them."""
+"""Scores whose range is at most this share of the largest count as constant up to rounding."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """One number that judges a reward; `measure` measures it."""
+    """One number that judges a reward, as `measure_rewards` returns it."""
 
     key: str
     label: str
-    """What people and `zest inspect --json` call it."""
+    """Name on pages and in `zest inspect --json`."""
     meaning: str
 
 
 FIGURES = (
     Figure("spearman", "Spearman ρ", "rank correlation of the episodes' returns with the true ones; 1 is best"),
     Figure("kendall", "Kendall τ-b", "the same by pairs; 1 is best"),
-    Figure("pairwise", "Pairwise accuracy", "share of pairs of episodes that are ordered rightly; .5 is chance"),
+    Figure("pairwise", "Pairwise accuracy", "share of pairs of episodes that are ordered correctly; .5 is chance"),
     Figure(
         "auprc",
         "AUPRC of success",
-        "how well the return tells successes; chance is their share, which is the next line",
+        "how well the return separates successes; chance is their share, which is the next line",
     ),
     Figure("successes", "Share of successes", "in the dataset"),
     Figure(
         "epic",
         "EPIC distance",
-        "of levels to the true reward, step by step; 0 is the same up to scale and offset, .71 unrelated",
+        "of the score to the true reward, step by step; 0 is equal up to scale and offset, .71 unrelated",
     ),
     Figure("value_order", "Value-order correlation", "of reward and time within an episode; 1 rises at every step"),
     Figure(
         "told_by_step",
         "Told by the step",
-        "share of the rewards' variance that the number of the step tells; 1 is a clock",
+        "share of the rewards' variance that the step number explains; 1 is a clock",
     ),
     Figure(
         "straight_in_time",
         "Straight in time",
-        "share of the score's variance within an episode that a straight line in time tells; 1 is proportional to time",
+        "R² of a linear trend of the score within an episode; 1 is proportional to time",
     ),
-    Figure("saturated", "Saturated", "share of rewards next to the lowest or the highest"),
-    Figure("still", "Nothing to see", "share of frames that show what the first one shows"),
+    Figure("saturated", "Saturated", "share of rewards close to the lowest or the highest"),
+    Figure("still", "Nothing to see", "share of frames that equal the first one"),
     Figure(
         "contradictory",
         "Contradictory",
-        "share of frames that score otherwise than an equal one of the same episode; 0 is right",
+        "share of frames that score differently from an equal frame of the same episode; 0 is right",
     ),
 )
-"""In the order in which they are shown."""
+"""In the order of display."""
 
 
 def true_returns(truth: Sequence[GroundTruth]) -> NDArray[np.float64]:
@@ -70,22 +70,21 @@ def true_returns(truth: Sequence[GroundTruth]) -> NDArray[np.float64]:
     return np.array([episode.episode_return for episode in truth])
 
 
-def measure(
+def measure_rewards(
     rewards: list[FloatArray],
     scores: list[FloatArray],
     frames: list[NDArray[np.float64]] | None,
     still: list[NDArray[np.bool_]] | None,
     truth: list[GroundTruth] | None,
 ) -> dict[str, Estimate]:
-    """Return the figures by the keys of `FIGURES`; those that need what is not known are missing.
+    """Return the figures by the keys of `FIGURES`; those that need missing arguments are missing.
 
     Args:
-        rewards: (T,) per episode, as a trainer sees them.
-        scores: (T,) per episode, of the frames after each action; the rewards, unless these are differences.
-        frames: (T, nq) states per episode after each action, rounded as they were rendered; None of other robots than
-            the kitchen's.
-        still: (T,) per episode, frames that show what the first one shows; None where that is not known.
-        truth: ground truth per episode, None where there is none.
+        rewards: (T,) per episode, as a trainer gets them.
+        scores: (T,) per episode, of the frames after each action; equal to the rewards unless those are differences.
+        frames: (T, nq) states per episode after each action, rounded as for rendering; None outside the kitchen.
+        still: (T,) per episode, whether the frame equals the first one; None where that is unknown.
+        truth: ground truth per episode; None where there is none.
     """
     figures = {
         "value_order": reward_quality.value_order(rewards),
@@ -98,12 +97,12 @@ def measure(
     if frames is not None:
         figures["contradictory"] = reward_quality.share_contradictory(scores, frames)
     if truth is not None:
-        returns, wanted = reward_quality.returns_of(rewards), true_returns(truth)
+        returns, targets = reward_quality.returns_of(rewards), true_returns(truth)
         success = np.array([episode.success for episode in truth])
         figures |= {
-            "spearman": statistics.spearman(returns, wanted),
-            "kendall": reward_quality.kendall(returns, wanted),
-            "pairwise": reward_quality.pairwise_accuracy(returns, wanted),
+            "spearman": statistics.spearman(returns, targets),
+            "kendall": reward_quality.kendall(returns, targets),
+            "pairwise": reward_quality.pairwise_accuracy(returns, targets),
             "auprc": reward_quality.average_precision(returns, success),
             "successes": statistics.wilson(int(success.sum()), len(success)),
             "epic": reward_quality.epic_distance(scores, [episode.rewards for episode in truth]),
@@ -111,15 +110,15 @@ def measure(
     return figures
 
 
-def warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimate]) -> list[str]:
-    """What speaks against training on these rewards: sentences, none when nothing does.
+def reward_warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimate]) -> list[str]:
+    """Return sentences that speak against training on these rewards, if any.
 
     Args:
         rewards: (T,) per episode.
-        figures: by the keys of `FIGURES`; those that were not measured are missing.
+        figures: of `measure_rewards`.
     """
-    every = np.concatenate(rewards)
-    if np.ptp(every) <= FLAT * np.abs(every).max():
+    values = np.concatenate(rewards)
+    if np.ptp(values) <= FLAT * np.abs(values).max():
         return ["All frames score the same: this goal and embedder tell nothing apart. Look at the goal's pictures."]
     sentences = []
     if np.ptp(reward_quality.returns_of(rewards)) == 0:

@@ -1,8 +1,8 @@
 """One episode that reaches several goals, one after another → its similarity to each of them over time.
 
-Cui et al. 2022, appendix "multi-step tasks": every sub-goal has a start and a goal picture of its own, and the change
-since the first frame of the *whole* episode is compared with each. Episodes are real video, or experts that do several
-kitchen tasks (`zest_rl.kitchen.task_sequence`).
+Cui et al. 2022, appendix "multi-step tasks": each sub-goal has its own start and goal picture, and the change since
+the first frame of the *whole* episode is compared with each. Episodes are real videos, or experts that do several
+kitchen tasks in turn (`zest_rl.kitchen.task_sequence`).
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ class SubGoalScores:
 
     name: str
     scores: FloatArray
-    """(T+1,) float32, of each frame."""
+    """(T+1,) float32, one per frame."""
     frames: tuple[Frame, ...]
-    """What the score sees at `steps`."""
+    """n frames (H, W, 3), those at `steps`."""
     steps: NDArray[np.intp]
     """(n,) evenly spaced over the episode."""
     done_at: int | None = None
-    """Step at which the ground truth has the sub-goal reached; None for real video."""
+    """Step at which the sub-goal is reached by ground truth; None for real video."""
 
     @property
     def highest_at(self) -> int:
@@ -52,16 +52,15 @@ class SubGoalScores:
 
     @property
     def rises_at(self) -> int | None:
-        """First step at which the score is half-way from its first to its highest value; None when it never rises."""
+        """First step at which the score is half-way from its first to its highest value; None if it never rises."""
         half = (self.scores[0] + self.scores.max()) / 2
         return int(np.argmax(self.scores >= half)) if self.highest_at > 0 else None
 
     def as_json(self) -> dict[str, Any]:
-        """Return when it rises, is highest and is reached, and the scores to four decimals."""
+        """Return the steps of rise, maximum and success, and the scores to four decimals."""
         scores = [round(float(score), 4) for score in self.scores]
-        return {
-            "rises_at": self.rises_at, "highest_at": self.highest_at, "done_at": self.done_at, "scores": scores,
-        }  # fmt: skip
+        steps = {"rises_at": self.rises_at, "highest_at": self.highest_at, "done_at": self.done_at}
+        return {**steps, "scores": scores}
 
 
 def rise_in_order(sub_goals: Sequence[SubGoalScores]) -> bool:
@@ -86,32 +85,32 @@ def follow_kitchen(
     n_workers: int | None = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[SubGoalScores]:
-    """Let experts do kitchen tasks, and score all states by the goal of each task, seen from that task's views.
+    """Let experts do kitchen tasks in turn, and score all states by each task's goal, seen from that task's views.
 
     Args:
-        tasks: what is done, in this order.
-        goal: goal spec, of every task.
+        tasks: in the order in which they are done.
+        goal: goal spec, for every task.
         embedder: URI of the network.
         features: see `zest_rl.rewards.scores`.
         similarity: see `zest_rl.rewards.scores`.
         precision: of the embedder.
         device: where the embedder runs.
         views: cameras around the object of each task.
-        tolerance: states that agree to this many rad or m are one.
+        tolerance: rad or m; states that differ by less are embedded once.
         seed: of the arm's start.
         n_workers: processes that embed, default one per core.
         on_progress: called with (tasks scored, tasks in all).
 
     Raises:
         BadInput: a task or the goal does not exist.
-        ZestError: an expert did not succeed from where it had to start.
+        ZestError: an expert did not succeed.
     """
     performance = perform(tasks, seed)
     config = ScorerConfig(goal, embedder, features, similarity, precision)
     sub_goals = []
     for task, done_at in performance.done_at.items():
-        seen = Views(task, views, tolerance=tolerance)
-        scorer = StateScorer.build(config, seen, performance.states[0], device=device, n_workers=n_workers)
+        cameras = Views(task, views, tolerance=tolerance)
+        scorer = StateScorer.build(config, cameras, performance.states[0], device=device, n_workers=n_workers)
         view = EpisodeView(scorer, performance.states)
         sub_goals.append(SubGoalScores(task, view.scores, tuple(view.frames), view.steps, done_at))
         on_progress(len(sub_goals), len(tasks))
@@ -119,14 +118,14 @@ def follow_kitchen(
 
 
 def read_sub_goal(spec: str, first: Frame) -> GoalSpec:
-    """Read what specifies one sub-goal of a video.
+    """Read the spec of one sub-goal of a video.
 
     Args:
         spec: a picture of the goal alone, a folder with ``init/`` and ``goal/``, or ``text:START -> GOAL``.
-        first: (H, W, 3) first frame of the video, the start that goes with a picture alone.
+        first: (H, W, 3) first frame of the video, which is the start if `spec` is a picture.
 
     Raises:
-        BadInput: none of the three, or it cannot be read.
+        BadInput: `spec` is none of the three, or cannot be read.
     """
     path = Path(spec).expanduser()
     if spec.startswith(TEXT):
@@ -155,17 +154,17 @@ def follow_video(
 
     Args:
         clip: a video, or a folder of pictures in the order of their names.
-        goals: of `read_sub_goal`, all different.
+        goals: specs of `read_sub_goal`, all different.
         embedder: URI of the network.
         features: see `zest_rl.rewards.scores`.
         similarity: see `zest_rl.rewards.scores`.
         precision: of the embedder.
         device: where the embedder runs.
-        n_frames: how many frames are looked at, evenly spaced.
+        n_frames: frames to score, evenly spaced.
 
     Raises:
-        BadInput: there is no sub-goal or one twice, the video or a sub-goal cannot be read, or a sentence meets an
-            embedder of pictures.
+        BadInput: there is no sub-goal or a duplicate, the video or a sub-goal cannot be read, or a goal is a sentence
+            and the embedder takes pictures only.
     """
     network = load_embedder(embedder, device=device, precision=precision)
     if not goals or len(set(goals)) < len(goals):
@@ -175,10 +174,10 @@ def follow_video(
     pairs = [embed_goal(spec, network) for spec in specs]
     (embeddings,) = embed_clips([Clip(clip, "")], network, n_frames)
     steps = evenly_spaced(len(frames), N_FRAMES)
-    shown = tuple(frames[step] for step in steps)
+    strip = tuple(frames[step] for step in steps)
     stems = [goal if goal.startswith(TEXT) else Path(goal).stem for goal in goals]
     names = stems if len(set(stems)) == len(stems) else goals
     return [
-        SubGoalScores(name, score_views(embeddings[:, None], starts, ends, features, similarity), shown, steps)
+        SubGoalScores(name, score_views(embeddings[:, None], starts, ends, features, similarity), strip, steps)
         for name, (starts, ends) in zip(names, pairs, strict=True)
     ]

@@ -1,6 +1,6 @@
-"""A run → its policy's returns and success: which starts, by which rule, in which folder, and how results are read.
+"""A run → the returns and successes of its policy, written to and read from the run's folder.
 
-All policies meet the same starts (paired seeds). Episodes run in parts, one part per core at a time.
+All policies get the same starts (paired seeds). Episodes run in parts, one part per core at a time.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from zest_rl.runtime.parallel import cached_jobs, chunks, one_thread, read_parts
 from zest_rl.types import EpisodeResult
 
 EPISODES_PER_JOB, N_JOBS = 5, 10
-"""An evaluation is cut into `N_JOBS` parts of at least so many episodes: small enough that all cores have work and a
-cut evaluation loses little, large enough that a policy acts on a batch."""
+"""An evaluation is split into `N_JOBS` parts of at least `EPISODES_PER_JOB` episodes: small enough that all cores have
+work and an interrupted evaluation loses little, large enough that a policy acts on a batch."""
 
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """What is run. Two evaluations with equal seeds start from equal states."""
+    """Which episodes are run. Two evaluations with equal seeds start from equal states."""
 
     n_episodes: int = 50
     seed: int = 1_000_000
@@ -73,7 +73,7 @@ class Evaluation:
     """Return that the policy was asked for; None for policies without one."""
     minimum: float
     expert: float
-    """Ground-truth returns that are 0 % and 100 %."""
+    """Ground-truth returns that count as 0 % and 100 %."""
     episodes: tuple[EpisodeResult, ...]
     traces: Arrays
     """What `run_episodes` returns: gt_reward, gt_success (N, T+1), qpos (N, T+1, nq), score (N, T+1) when scored, and
@@ -81,7 +81,7 @@ class Evaluation:
 
     @property
     def folder(self) -> Path:
-        """Where the result and the videos are."""
+        """Folder of the result and the videos."""
         return evaluation_folder(self.run, self.config)
 
     def normalized(self) -> NDArray[np.float64]:
@@ -89,7 +89,7 @@ class Evaluation:
         return normalized_return(np.array([e.gt_return for e in self.episodes]), self.minimum, self.expert)
 
     def summary(self) -> dict[str, Any]:
-        """JSON-ready: mean with its interval, IQM, success rate; of a foreign policy, the share of clipped actions."""
+        """Return as JSON mean with interval, IQM, success rate; of a foreign policy, the share of clipped actions."""
         values = self.normalized()
         success = wilson(sum(e.success for e in self.episodes), len(self.episodes))
         return {
@@ -98,15 +98,15 @@ class Evaluation:
             "success": asdict(success),
             "n_episodes": len(self.episodes),
             "target_return": self.target_return,
-            **({"clipped_actions": self._clipped_share()} if "clipped" in self.traces else {}),
-        }
-
-    def _clipped_share(self) -> float:
-        return float(self.traces["clipped"].sum() / sum(episode.n_steps for episode in self.episodes))
+        } | (
+            {"clipped_actions": float(self.traces["clipped"].sum() / sum(e.n_steps for e in self.episodes))}
+            if "clipped" in self.traces
+            else {}
+        )
 
 
 def target_return(policy: Policy, config: EvaluationConfig) -> float | None:
-    """Return what a return-conditioned policy is asked for: a quantile of its training returns; else None."""
+    """Return the return that a policy is asked for, a quantile of its training returns; None if it uses no return."""
     if not policy.uses_return:
         return None
     quantiles = np.asarray(policy.meta["return_quantiles"], dtype=np.float64)
@@ -115,7 +115,7 @@ def target_return(policy: Policy, config: EvaluationConfig) -> float | None:
 
 @functools.lru_cache(maxsize=2)
 def _scorer(path: Path, sha256: str) -> StateScorer:
-    """Load a scorer once per process; `sha256` tells a changed file apart."""
+    """Load a scorer once per process; a changed file has another `sha256`."""
     return StateScorer.load(path, n_workers=1)
 
 
@@ -140,20 +140,19 @@ def evaluate(
     n_workers: int | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> Evaluation:
-    """Evaluate the policy that a run ended with; finished parts are kept, so a cut evaluation goes on where it stopped.
+    """Evaluate the final policy of a run; finished parts are kept, so an interrupted evaluation goes on from there.
 
     Args:
-        run: folder that `zest_rl.training.runs.train` or `zest_rl.training.adoption.adopt` left.
+        run: folder of `zest_rl.training.runs.train` or `zest_rl.training.adoption.adopt`.
         config: seeds and return-to-go; default `EvaluationConfig()`.
-        score: also record ZeST scores where the policy does not need them.
+        score: record ZeST scores even if the policy does not need them.
         videos: also write `episode_videos`.
         device: where the policy runs.
         n_workers: number of processes, default one per core.
-        on_progress: called with the number of episodes that were finished.
+        on_progress: called with the number of episodes finished since the last call.
 
     Raises:
-        BadInput: the run was not trained to its end, is of another robot than the kitchen's, or has no scorer although
-            scores are asked for.
+        BadInput: the run is unfinished, is not of the kitchen, or has no scorer although scores are needed.
         ZestError: a part of the run is damaged.
     """
     config = EvaluationConfig() if config is None else config
@@ -215,15 +214,15 @@ def evaluate(
 
 
 def is_evaluable(dataset: DatasetRecord) -> bool:
-    """Whether a run on this dataset is of the environment that `evaluate` runs."""
+    """Whether `evaluate` can run the environment of this dataset."""
     return not dataset.is_foreign or dataset.env.get("id") == ENV_ID
 
 
 def check_finished(run: Path) -> None:
-    """Refuse what is not the folder of a finished training.
+    """Check that a folder holds a finished run.
 
     Raises:
-        BadInput: it is not; the message says whether there is an unfinished one.
+        BadInput: it does not; the message says whether it holds an unfinished one.
     """
     if not (run / "meta.json").exists():
         raise BadInput(
@@ -234,7 +233,7 @@ def check_finished(run: Path) -> None:
 
 
 def read_evaluation(folder: Path) -> Evaluation:
-    """Read what `evaluate` left in ``RUN/evaluations/NAME``.
+    """Read the result of `evaluate` from ``RUN/evaluations/NAME``.
 
     Raises:
         ZestError: there is no result, or a part is damaged; evaluate again.
@@ -253,12 +252,12 @@ def read_evaluation(folder: Path) -> Evaluation:
 
 
 def evaluation_folder(run: Path, config: EvaluationConfig) -> Path:
-    """Where `evaluate` leaves its parts, ``result.json`` and videos."""
+    """Return the folder of the parts, ``result.json`` and videos of `evaluate`."""
     return run / "evaluations" / artifacts.hash_json(asdict(config))[:8]
 
 
 def episode_videos(evaluation: Evaluation) -> dict[str, Video]:
-    """Return the videos of the best, the median and the worst episode, whether or not they are written yet."""
+    """Return the videos of the best, the median and the worst episode, which need not be written yet."""
     return {
         which: Video(evaluation.traces["qpos"][index], evaluation.folder / f"{which}.mp4")
         for which, index in representative(evaluation.normalized()).items()

@@ -1,7 +1,7 @@
-"""Policy + environment (+ scorer for the online return-to-go) → what happened in N episodes, run in lockstep.
+"""Policy + environment (+ scorer for the online return-to-go) → traces of N episodes, run in lockstep.
 
-The Decision Transformer's return-to-go falls by the *online ZeST score* of each new state, in the units of the rewards
-it was trained on. Ground-truth rewards are recorded, and shown to no policy but one that was trained on them.
+The Decision Transformer's return-to-go falls by the *online ZeST score* of each new state, in the units of its training
+rewards. Ground-truth rewards are recorded; only a policy that was trained on them gets them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def uses_online_scores(policy: Policy, rtg: Rtg) -> bool:
-    """Whether each new state has to be scored while the policy acts."""
+    """Whether each new state must be scored while the policy acts."""
     return policy.uses_return and rtg == "online" and _record(policy).relabel is not None
 
 
@@ -44,14 +44,14 @@ def run_episodes(
     Args:
         policy: acts on all episodes at once.
         seeds: of the environments' resets.
-        rtg: how the return-to-go falls. With ``"online"``, that of a policy that was trained on ground-truth rewards
-            falls by those: the upper bound of the comparison.
-        target_return: what a policy that uses returns is asked for.
+        rtg: how the return-to-go falls. With ``"online"``, a policy trained on ground-truth rewards gets those, the
+            upper bound of the comparison.
+        target_return: the return that a policy is asked for, if it uses returns.
         scorer: scores each new state; needed for ``rtg="online"`` with ZeST rewards.
 
     Returns:
-        gt_reward (N, T+1) float32, gt_success (N, T+1) bool, qpos (N, T+1, nq), score (N, T+1) if scored, and what
-        `Policy.end` returns.
+        gt_reward (N, T+1) float32, gt_success (N, T+1) bool, qpos (N, T+1, nq), score (N, T+1) if scored, and the
+        results of `Policy.end`.
 
     Raises:
         BadInput: the environment is not the kitchen, or the policy needs scores and there is no scorer.
@@ -67,7 +67,7 @@ def run_episodes(
     envs = [gymnasium.make(spec) for _ in seeds]
     resets = [env.reset(seed=seed) for env, seed in zip(envs, seeds, strict=True)]
     obs = np.stack([first for first, _ in resets])
-    trace = [_measure([info for _, info in resets])]
+    trace = [_ground_truth([info for _, info in resets])]
     first_qpos = trace[0]["qpos"]
     scores = [scorer.score_now(first_qpos, first_qpos)] if scorer is not None else []
     try:
@@ -76,7 +76,7 @@ def run_episodes(
             results = [env.step(action) for env, action in zip(envs, policy.act(obs), strict=True)]
             obs = np.stack([result[0] for result in results])
             rewards = np.array([result[1] for result in results], dtype=np.float32)
-            trace.append(_measure([result[4] for result in results]))
+            trace.append(_ground_truth([result[4] for result in results]))
             if scorer is not None:
                 scores.append(scorer.score_now(first_qpos, trace[-1]["qpos"]))
                 difference = dataset.relabel is not None and dataset.relabel.reward == "difference"
@@ -84,10 +84,10 @@ def run_episodes(
             if policy.uses_return:
                 policy.observe(_decrement(policy, rtg, step, rewards))
     finally:
-        further = policy.end()
+        results_of_policy = policy.end()
         for env in envs:
             env.close()
-    arrays = {name: np.stack([moment[name] for moment in trace], axis=1) for name in trace[0]} | further
+    arrays = {name: np.stack([step[name] for step in trace], axis=1) for name in trace[0]} | results_of_policy
     if scorer is not None:
         arrays["score"] = np.stack(scores, axis=1)
     return arrays
@@ -98,7 +98,7 @@ def _record(policy: Policy) -> DatasetRecord:
 
 
 def _kitchen_spec(env_spec: str) -> gymnasium.envs.registration.EnvSpec:
-    """Read the EnvSpec of a run; the run may come from somebody else, so it must not run code of its choice."""
+    """Read the EnvSpec of a run, which may come from somebody else and must not choose what code is run."""
     check_env_spec(env_spec, "the environment of the run", "evaluate a run on a dataset of the kitchen")
     spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
     if spec.id != ENV_ID or spec.max_episode_steps is None:
@@ -110,8 +110,8 @@ def _kitchen_spec(env_spec: str) -> gymnasium.envs.registration.EnvSpec:
     return spec
 
 
-def _measure(infos: Sequence[Mapping[str, Any]]) -> Arrays:
-    """Return ground truth and positions of one moment of N episodes."""
+def _ground_truth(infos: Sequence[Mapping[str, Any]]) -> Arrays:
+    """Return gt_reward (N,), gt_success (N,) and qpos (N, nq) of one time step."""
     return {
         "gt_reward": np.array([info["gt"]["reward"] for info in infos]),
         "gt_success": np.array([info["gt"]["success"] for info in infos]),
@@ -120,7 +120,7 @@ def _measure(infos: Sequence[Mapping[str, Any]]) -> Arrays:
 
 
 def _decrement(policy: Policy, rtg: Rtg, step: int, rewards: FloatArray) -> FloatArray:
-    """By how much the return-to-go of each episode falls after `step`."""
+    """Return by how much the return-to-go of each episode falls after `step`: (N,)."""
     if rtg == "constant":
         return np.zeros_like(rewards)
     if rtg == "schedule":
