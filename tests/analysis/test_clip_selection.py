@@ -110,7 +110,7 @@ def test_labels_are_found_where_any_release_has_them(root: Path, name: str) -> N
 def test_clips_are_embedded_once(root: Path) -> None:
     clips, embedder = something_something(root)[:2], load_embedder("efficientnet-lite0")
     done: list[None] = []
-    first = embed_clips(clips, embedder, 4, on_done=lambda: done.append(None))
+    first = embed_clips(clips, embedder, 4, on_progress=lambda *_: done.append(None))
     np.testing.assert_allclose(first[0], embedder.embed_images(read_frames(clips[0].path, 4)), atol=1e-4)
     assert len(done) == 2
     copies = [Clip(clip.path.rename(root / VIDEOS / f"moved-{clip.path.name}"), "oven") for clip in clips]

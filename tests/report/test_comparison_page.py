@@ -78,8 +78,8 @@ def test_a_report_compares_methods_with_the_dataset_and_shows_goal_episodes_and_
     assert [goal.name for goal in report.items(GOALS)] == ["scene"]
     curves = report.items(LEARNING_CURVES)
     assert [curve.name for curve in curves] == ["BC", "DT on same-scene"]
-    assert curves[0].low is not None, "two seeds have a range"
-    assert curves[1].low is None
+    assert curves[0].band is not None, "two seeds have a range"
+    assert curves[1].band is None
     assert report.items(CAVEATS) == ("small",)
     best = max(report.items(RESULTS)[1:], key=lambda row: row.mean)
     assert report.summary.startswith(f"{best.method} reaches {best.mean:.1f} % of the expert's return")
@@ -158,8 +158,8 @@ def test_a_return_curve_holds_the_snapshots_that_were_evaluated_in_every_run(tra
         assert curve is not None
         assert curve.steps.tolist() == [1, float(json.loads((runs[0] / "meta.json").read_text())["n_updates"])]
         np.testing.assert_allclose(curve.values, [np.mean(means) - fall, np.mean(means)], rtol=1e-5, atol=1e-4)
-        assert curve.low is not None
-        np.testing.assert_allclose(curve.low, [min(means) - fall, min(means)], rtol=1e-5, atol=1e-4)
+        assert curve.band is not None
+        np.testing.assert_allclose(curve.band[0], [min(means) - fall, min(means)], rtol=1e-5, atol=1e-4)
     snapshot = runs[0] / "snapshots" / "update-000000001"
     report = compare("one policy on the way", methods_of_runs([snapshot]), source_id=None, goals={})
     assert [row.n_episodes for row in report.items(RESULTS)] == [2]
@@ -180,7 +180,7 @@ def test_a_learning_curve_is_the_mean_of_the_logged_losses_with_their_range(trai
     losses = np.stack([log["loss"] for log in logs])
     np.testing.assert_array_equal(curve.steps, logs[0]["update"])
     np.testing.assert_allclose(curve.values, losses.mean(axis=0), rtol=1e-6)
-    np.testing.assert_allclose([curve.low, curve.high], [losses.min(axis=0), losses.max(axis=0)], rtol=1e-6)
+    np.testing.assert_allclose(curve.band, [losses.min(axis=0), losses.max(axis=0)], rtol=1e-6)
 
 
 # --- which runs are one method ----------------------------------------------------------------------------------------

@@ -311,8 +311,8 @@ def test_parts_that_do_not_fit_together_are_refused(report: Report) -> None:
         Scatter("s", three, four, 0.0)
     with pytest.raises(BadInput, match=r"2 sources and 1 goals must have shape \(2, 1\), got \(1, 2\)"):
         Matrix(("door", "knob"), ("delta",), *np.zeros((3, 1, 2), np.float32))
-    with pytest.raises(BadInput, match="needs both low and high"):
-        Curve("BC", "loss", three, three, low=three)
+    with pytest.raises(BadInput, match="got steps 3, values 3, low 4, high 4"):
+        Curve("BC", "loss", three, three, (four, four))
     with pytest.raises(BadInput, match=r"unknown kind 'metod'; did you mean 'method'"):
         MethodRow("BC", 1, 0, 2, 1, 0, 1, 1, kind="metod")  # type: ignore[arg-type]
     with pytest.raises(BadInput, match=r"shape \(H, W, 3\) and dtype uint8, got shape \(4, 4\) and dtype float64"):

@@ -7,7 +7,6 @@ That is our reading; Cui et al. 2022 (§5.2) do not say which frames count.
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -189,13 +188,7 @@ def select_clips(
     goal_clips = clips if within else _first_of_each(goal_clips, things, max_clips)
     network = load_embedder(embedder, device=device, precision=precision)
     distinct = clips if within else [*clips, *goal_clips]
-    numbers = itertools.count(1)
-
-    def on_done() -> None:
-        if on_progress is not None:
-            on_progress(next(numbers), len(distinct))
-
-    vectors = embed_clips(distinct, network, n_frames, on_done)
+    vectors = embed_clips(distinct, network, n_frames, on_progress)
     embeddings, goal_embeddings = vectors[: len(clips)], vectors[-len(goal_clips) :]
     objects = {}
     for thing in things:

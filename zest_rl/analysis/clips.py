@@ -130,7 +130,7 @@ def _visible(folder: Path) -> list[Path]:
 
 
 def embed_clips(
-    clips: Sequence[Clip], embedder: Embedder, n_frames: int, on_done: Callable[[], object] = lambda: None
+    clips: Sequence[Clip], embedder: Embedder, n_frames: int, on_progress: Callable[[int, int], None] | None = None
 ) -> list[FloatArray]:
     """Embed clips, each once: embeddings are cached by content.
 
@@ -138,7 +138,7 @@ def embed_clips(
         clips: to be embedded.
         embedder: the network.
         n_frames: of each clip.
-        on_done: called after each clip.
+        on_progress: called with (clips embedded, clips in all).
 
     Returns:
         (n, D) float32 per clip.
@@ -155,5 +155,6 @@ def embed_clips(
                 cached = {"embeddings": embedder.embed_images(read_frames(clip.path, n_frames))}
             write_arrays(path, cached)
         vectors.append(np.asarray(cached["embeddings"], dtype=np.float32))
-        on_done()
+        if on_progress is not None:
+            on_progress(len(vectors), len(clips))
     return vectors

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -142,7 +143,10 @@ def _figures_to_json(inspection: Inspection) -> dict[str, Any]:
 
 
 def inspect_datasets(
-    datasets: Sequence[str], *, n_workers: int | None = None, on_progress: Callable[[int, int], None] | None = None
+    datasets: Sequence[str],
+    *,
+    n_workers: int | None = None,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> JointInspection:
     """Inspect relabeled datasets and, where they are of several tasks, compare their goals across the tasks.
 
@@ -157,13 +161,10 @@ def inspect_datasets(
     ids = tuple(dict.fromkeys(datasets))
     if not ids:
         raise BadInput("`zest inspect` needs at least 1 dataset; `zest relabel` makes them")
-    n_done = 0
+    n_parts, numbers = 2 * len(ids), itertools.count(1)
 
     def advance() -> None:
-        nonlocal n_done
-        n_done += 1
-        if on_progress is not None:
-            on_progress(n_done, 2 * len(ids))
+        on_progress(next(numbers), n_parts)
 
     inspections, views, left_out = [], {}, []
     for dataset in ids:
@@ -183,6 +184,6 @@ def inspect_datasets(
         else:
             for dataset, sentence in confusion_warnings(inspections, compared).items():
                 warnings[dataset] = (*warnings[dataset], sentence)
-    if on_progress is not None and n_done < 2 * len(ids):
-        on_progress(1, 1)
+    if next(numbers) <= n_parts:
+        on_progress(n_parts, n_parts)
     return JointInspection(tuple(inspections), views, compared, warnings, tuple(left_out))

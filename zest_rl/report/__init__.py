@@ -1,6 +1,5 @@
-"""Results → one self-contained HTML file, for people who choose a reward by looking.
+"""Results → one self-contained HTML file, for people who judge rewards by eye.
 
-`sections` lists what a page may hold and `content` what that is made of; `charts` draws it as SVG, and `html` puts it
-into the templates. One module per kind of result builds its page: `comparison_page`, `inspection_page`,
-`sub_goal_page`.
+`sections` lists the kinds of section, `content` their items; `charts` draws items as SVG, and `html` fills the
+templates. Each kind of result has a module that builds its page: `comparison_page`, `inspection_page`, `sub_goal_page`.
 """

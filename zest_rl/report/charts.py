@@ -18,7 +18,7 @@ from zest_rl.report.content import Curve, EpisodePanel, MethodRow, Scatter
 from zest_rl.types import FloatArray
 
 MISSING = "–"
-"""What stands where a figure is not finite."""
+"""Text of a figure that is not finite."""
 N_LINE_STYLES = 6
 """Line styles in `style.css`; a chart with more curves repeats them."""
 
@@ -62,7 +62,7 @@ def axis_over(values: Iterable[float], n_ticks: int, margin: float) -> Axis:
     round_steps = [m * power for m in (0.5, 1, 2, 5, 10)]
     fewest = next(i for i, step in enumerate(round_steps) if step >= rough * 0.999)
     ticks: tuple[float, ...] = ()
-    while len(ticks) < 2:  # a step a little shorter than the axis may fall on it once only
+    while len(ticks) < 2:  # a step slightly shorter than the axis may give one tick only
         step = round_steps[fewest]
         first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
         ticks = tuple(k * step for k in range(first, last + 1))
@@ -86,7 +86,7 @@ def _y_ticks(y: Axis) -> str:
 
 
 def _image(style: str, label: str, parts: Iterable[str], **data: object) -> Markup:
-    """Return an SVG with what a screen reader says of it; `parts` are markup."""
+    """Return an SVG with a label for screen readers; `parts` are markup."""
     extra = Markup("").join(Markup(' data-{}="{}"').format(name, value) for name, value in data.items())
     head = Markup('<svg class="{}" role="img" aria-label="{}"{}>').format(style, label, extra)
     return head + Markup("".join(parts)) + Markup("</svg>")
@@ -94,8 +94,8 @@ def _image(style: str, label: str, parts: Iterable[str], **data: object) -> Mark
 
 def results_axis(rows: Sequence[MethodRow]) -> Axis:
     """Return the axis that the bars of a table share; it holds 0 % and 100 %."""
-    figures = [v for row in rows for v in (row.mean, row.ci_low, row.ci_high, row.paper_value) if v is not None]
-    return axis_over([0, 100, *figures], 5, 0.02)
+    values = [v for row in rows for v in (row.mean, row.ci_low, row.ci_high, row.paper_value) if v is not None]
+    return axis_over([0, 100, *values], 5, 0.02)
 
 
 def interval_bar(row: MethodRow, axis: Axis) -> Markup:
@@ -116,7 +116,7 @@ def interval_bar(row: MethodRow, axis: Axis) -> Markup:
 
 
 def axis_labels(axis: Axis) -> Markup:
-    """Return the tick labels that stand above a column of `interval_bar`."""
+    """Return the tick labels above a column of `interval_bar`."""
     ticks = "".join(
         f'<text x="{axis.percent(t):.2f}%" y="1em" class="x tick">{axis.label(t)}</text>' for t in axis.ticks
     )
@@ -143,10 +143,10 @@ def correlation_gauge(value: float) -> Markup:
 
 def scatter_chart(scatter: Scatter) -> Markup:
     """Return one dot per finite point, with a hover title."""
-    x, y = axis_over(scatter.x[scatter.shown], 4, 0.05), axis_over(scatter.y[scatter.shown], 6, 0.05)
+    x, y = axis_over(scatter.x[scatter.finite], 4, 0.05), axis_over(scatter.y[scatter.finite], 6, 0.05)
     dot = Markup('<circle class="point" cx="{:.2f}%" cy="{:.2f}%" r="4"><title>{} {}: {} {}, {} {}</title></circle>')
     dots = []
-    for i in scatter.shown:
+    for i in scatter.finite:
         across, up = float(scatter.x[i]), float(scatter.y[i])
         title = (scatter.point, i, scatter.y_name, number(up), scatter.x_name, number(across))
         dots.append(dot.format(x.percent(across), 100 - y.percent(up), *title))
@@ -168,7 +168,7 @@ class Line:
     """Lower and upper edge, each (n,)."""
 
 
-def _path(line: Line, x: Axis, y: Axis) -> str:
+def _line_path(line: Line, x: Axis, y: Axis) -> str:
     commands, pen_down = [], False
     for px, py in zip(line.x, line.y, strict=True):
         if not (math.isfinite(px) and math.isfinite(py)):
@@ -213,17 +213,17 @@ def line_chart(
 
     Args:
         lines: at least one.
-        label: what a screen reader says.
+        label: for screen readers.
         tall: full height, with more ticks; else about half of it.
-        y_holds: what the y axis holds besides the lines and their bands.
-        scrub: add what `script.js` moves with the video: a cursor, a dot, and the first line's values.
+        y_holds: values that the y axis covers besides the lines and their bands.
+        scrub: add the parts that `script.js` moves with the video: a cursor, a dot, and the first line's values.
         show_x: label the x axis (charts stacked on one axis label it once).
     """
     edges = [edge for line in lines if line.band for edge in line.band]
     x = axis_over(np.concatenate([line.x for line in lines]), 5, 0)
     y = axis_over(np.concatenate([*(line.y for line in lines), *edges, y_holds]), 5 if tall else 3, 0.05)
     bands = "".join(_band(line, x, y) for line in lines)
-    paths = "".join(f'<path class="line {line.style}" d="{_path(line, x, y)}"/>' for line in lines)
+    paths = "".join(f'<path class="line {line.style}" d="{_line_path(line, x, y)}"/>' for line in lines)
     plot = f'<svg viewBox="0 0 100 100" preserveAspectRatio="none" overflow="visible">{bands}{paths}</svg>'
     data: dict[str, object] = {}
     if scrub:
@@ -253,14 +253,14 @@ def curve_chart(quantity: str, curves: Sequence[Curve], styles: Sequence[str]) -
 
 
 def score_range(episodes: Iterable[EpisodePanel]) -> tuple[float, float]:
-    """Return the lowest and the highest finite score of all episodes, and 0 within."""
+    """Return the lowest and the highest finite score of all episodes; the range includes 0."""
     scores = [e.scores[np.isfinite(e.scores)] for e in episodes if e.scores is not None]
-    every = np.concatenate([*scores, np.zeros(1)])
-    return float(every.min()), float(every.max())
+    values = np.concatenate([*scores, np.zeros(1)])
+    return float(values.min()), float(values.max())
 
 
 def score_chart(panel: EpisodePanel, y_holds: tuple[float, float]) -> Markup:
-    """Return the scores of an episode, on an axis that those of others share."""
+    """Return the scores of an episode, on a y axis that covers `y_holds`."""
     assert panel.scores is not None
     label = f"ZeST score over {len(panel.scores) - 1} steps of {panel.title}"
     line = Line(np.arange(len(panel.scores), dtype=np.float32), panel.scores, "score")
@@ -268,7 +268,7 @@ def score_chart(panel: EpisodePanel, y_holds: tuple[float, float]) -> Markup:
 
 
 def progress_chart(panel: EpisodePanel) -> Markup:
-    """Return the ground-truth progress of an episode, and that of the one beside it."""
+    """Return the ground-truth progress of an episode, and that of the episode beside it."""
     steps = np.arange(len(panel.gt_progress), dtype=np.float32)
     lines = [Line(steps, panel.gt_progress, "gt")]
     if panel.beside is not None:

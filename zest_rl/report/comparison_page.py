@@ -1,4 +1,4 @@
-"""Evaluated runs + their datasets → the report that compares them. Reads ground truth; trains and chooses nothing."""
+"""Evaluated runs + their datasets → the report that compares them. Reads ground truth; trains and selects nothing."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from zest_rl.training.checkpoints import snapshots
 
 
 def method_row(method: Method, *tasks: Sequence[Evaluation]) -> MethodRow:
-    """Summarise the evaluations of one method: for each task one per seed."""
+    """Summarise the evaluations of one method: per task, one per seed."""
     groups = [[evaluation.normalized() for evaluation in evaluations] for evaluations in tasks]
     episodes = [episode for evaluations in tasks for evaluation in evaluations for episode in evaluation.episodes]
     return _row(
@@ -77,7 +77,7 @@ def _row(groups: list[list[NDArray[np.float64]]], success_rate: float, **named: 
 
 
 def return_curve(method: Method) -> Curve | None:
-    """Normalized return over gradient steps, mean and range over seeds; None without snapshots evaluated alike."""
+    """Return normalized returns over gradient steps, with their range over seeds; None without evaluated snapshots."""
     if not all(map(snapshots, method.runs)):
         return None
     columns: list[dict[int, float]] = []
@@ -96,10 +96,10 @@ def return_curve(method: Method) -> Curve | None:
 
 
 def learning_curve(method: Method) -> Curve | None:
-    """Training loss over gradient steps, the mean over seeds with their range; None where it was not logged twice."""
+    """Return the training loss over gradient steps, with its range over seeds; None if logged less than twice."""
     columns = []
     if not all((run / "metrics.csv").exists() for run in method.runs):
-        return None  # a snapshot has no log of its own
+        return None  # a snapshot has no log
     for run in method.runs:
         with (run / "metrics.csv").open(newline="") as file:
             columns.append([(float(row["update"]), float(row["loss"])) for row in csv.DictReader(file)])
@@ -115,17 +115,10 @@ def learning_curve(method: Method) -> Curve | None:
 
 
 def _curve(name: str, quantity: str, steps: Sequence[float], columns: Sequence[Sequence[float]]) -> Curve:
-    """Mean and range over seeds: one column per seed, each as long as `steps`."""
+    """Return mean and range over seeds; `columns` has one column per seed, each as long as `steps`."""
     values = np.array(columns, dtype=np.float32)
-    several = len(values) > 1
-    return Curve(
-        name,
-        quantity,
-        np.array(steps, dtype=np.float32),
-        values.mean(axis=0),
-        values.min(axis=0) if several else None,
-        values.max(axis=0) if several else None,
-    )
+    band = (values.min(axis=0), values.max(axis=0)) if len(values) > 1 else None
+    return Curve(name, quantity, np.array(steps, dtype=np.float32), values.mean(axis=0), band)
 
 
 def compare_runs(runs: Sequence[Path], *, title: str) -> Report:
@@ -133,7 +126,7 @@ def compare_runs(runs: Sequence[Path], *, title: str) -> Report:
 
     Args:
         runs: folders; those that differ in their seed alone become one row.
-        title: headline.
+        title: of the page.
 
     Raises:
         BadInput: no run is given, or as in `methods_of_runs` and `compare`.
@@ -168,13 +161,13 @@ def compare(
     """Build the report of several methods on one task.
 
     Args:
-        title: headline.
+        title: of the page.
         methods: rows, in the order of the table.
         source_id: the collected dataset, for the "Demo" row; None leaves the row out.
         goals: name → relabeled dataset.
         paper_demo: the paper's figure for "Demo", in percent.
-        caveats: sentences shown at the end.
-        details: shown as collapsed JSON, beside the runs' own meta.
+        caveats: sentences below the results.
+        details: name → JSON, in collapsed blocks with the runs' meta.
         film: makes the episodes' videos.
 
     Raises:
@@ -241,14 +234,14 @@ def overview(
     """Build the page over several tasks: every method over all tasks together, then each task.
 
     Args:
-        title: headline.
+        title: of the page.
         methods: task → rows; the same methods, in the same order, for every task.
         reports: task → its own report.
         pages: task → file name of that report, beside this one.
         sources: the collected datasets.
         paper_demo: the paper's figure for "Demo", in percent.
-        caveats: sentences shown at the end.
-        details: shown as collapsed JSON.
+        caveats: sentences below the results.
+        details: name → JSON, in collapsed blocks.
     """
     by_name = zip(*methods.values(), strict=True)
     rows = [method_row(group[0], *(method.evaluations() for method in group)) for group in by_name]
@@ -280,7 +273,7 @@ def _best_sentence(rows: Sequence[MethodRow], where: str = "") -> str:
 
 
 def _unequal_starts(evaluations: dict[str, list[Evaluation]]) -> list[str]:
-    """Say so when methods did not meet the same starts."""
+    """Return a sentence if the methods were evaluated on different starts."""
     starts = {name: {evaluation.config.starts for evaluation in group} for name, group in evaluations.items()}
     if len(set().union(*starts.values())) == 1:
         return []

@@ -1,7 +1,7 @@
-"""What the sections of a report are made of: frozen dataclasses, checked where they are built.
+"""The items of a report's sections: frozen dataclasses, checked where they are built.
 
-Returns are normalized: 100 % is the expert, 0 % is the robot that does nothing. A figure that could not be computed is
-NaN and is shown as "–".
+Returns are normalized: 100 % is the expert, 0 % is a robot that does nothing. A figure that could not be computed is
+NaN and is displayed as "–".
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ from zest_rl.types import FloatArray, Frame
 Kind = Literal["dataset", "method", "control"]
 
 
-def _check_equal_lengths(what: str, lengths: Mapping[str, int]) -> None:
+def _check_equal_lengths(name: str, lengths: Mapping[str, int]) -> None:
     if len(set(lengths.values())) > 1:
-        got = ", ".join(f"{name} {n}" for name, n in lengths.items())
-        raise BadInput(f"{what}: {' and '.join(lengths)} must be equally long, got {got}; pass one value for each step")
+        got = ", ".join(f"{array} {n}" for array, n in lengths.items())
+        raise BadInput(
+            f"{title}: {' and '.join(lengths)} must be equally long, got {got}; pass one value for each step"
+        )
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class MethodRow:
     n_episodes: int
     """Evaluated episodes, over all seeds."""
     kind: Kind = "method"
-    """`dataset`: the demonstrations; `method`: what is compared; `control`: what must do worse or is a bound."""
+    """`dataset`: the demonstrations; `method`: what is compared; `control`: what must do worse, or a bound."""
     note: str = ""
     paper_value: float | None = None
     """The paper's mean normalized return, in %; None when the paper has no such figure."""
@@ -81,7 +83,7 @@ class GoalPanel:
 
 @dataclass(frozen=True)
 class EpisodePanel:
-    """One evaluated episode: its video beside its scores."""
+    """One evaluated episode: its video and its scores."""
 
     title: str
     method: str
@@ -90,11 +92,11 @@ class EpisodePanel:
     """In %."""
     success: bool
     video: Path
-    """MP4 file with H.264 video, which every browser plays; it is embedded."""
+    """MP4 file with H.264 video, which every browser plays; the page embeds it."""
     fps: float
     """Episode steps per second of video: the frame rate when every step is one frame."""
     gt_progress: FloatArray
-    """(T+1,) float32, the ground-truth progress of the task's joint in [0, 1]; shown as evaluation only."""
+    """(T+1,) float32, the ground-truth progress of the task's joint in [0, 1]; marked as evaluation only."""
     scores: FloatArray | None = None
     """(T+1,) float32, the ZeST score of every frame; None when the policy was not scored."""
     beside: tuple[str, FloatArray] | None = None
@@ -136,8 +138,8 @@ class Scatter:
         _check_equal_lengths(self.name, {"x": len(self.x), "y": len(self.y)})
 
     @property
-    def shown(self) -> NDArray[np.intp]:
-        """(m,) indices of the points that are finite, which alone are drawn."""
+    def finite(self) -> NDArray[np.intp]:
+        """Indices (m,) of the finite points; the others are not drawn."""
         return np.flatnonzero(np.isfinite(self.x) & np.isfinite(self.y))
 
 
@@ -146,28 +148,19 @@ class Curve:
     """One line over gradient steps, or over the steps of an episode; curves of the same quantity share a chart."""
 
     name: str
-    """What the legend calls it: a method, a view, a group of episodes."""
+    """Name in the legend: a method, a view, a group of episodes."""
     quantity: str
-    """What is drawn upward, with its unit: `validation loss`."""
+    """Label of the y axis, with its unit: `validation loss`."""
     steps: FloatArray
     """(n,) float32."""
     values: FloatArray
     """(n,) float32."""
-    low: FloatArray | None = None
-    """(n,) float32, lower edge of the band around `values`; needs `high`."""
-    high: FloatArray | None = None
-    """(n,) float32, upper edge."""
+    band: tuple[FloatArray, FloatArray] | None = None
+    """(n,) float32 each, lower and upper edge of a band around `values`."""
 
     def __post_init__(self) -> None:
-        if (self.low is None) != (self.high is None):
-            raise BadInput(f"{self.name}: a band needs both low and high, got one of them; pass both or neither")
-        arrays = {"steps": self.steps, "values": self.values, "low": self.low, "high": self.high}
-        _check_equal_lengths(self.name, {name: len(a) for name, a in arrays.items() if a is not None})
-
-    @property
-    def band(self) -> tuple[FloatArray, FloatArray] | None:
-        """Lower and upper edge, where there are both."""
-        return None if self.low is None or self.high is None else (self.low, self.high)
+        edges = {} if self.band is None else {"low": len(self.band[0]), "high": len(self.band[1])}
+        _check_equal_lengths(self.name, {"steps": len(self.steps), "values": len(self.values), **edges})
 
 
 @dataclass(frozen=True)
@@ -187,7 +180,7 @@ class Strip:
     title: str
     frames: tuple[Frame, ...]
     steps: NDArray[np.intp]
-    """(n,) which step of the episode each is."""
+    """(n,) step of the episode of each frame."""
     scores: FloatArray
     """(n,) float32, normalised: 0 is the lowest and 1 the highest score of the dataset, or of the episode alone."""
 
@@ -199,7 +192,7 @@ class Strip:
 
 @dataclass(frozen=True)
 class QualityRow:
-    """One figure that judges rewards, for each of several datasets."""
+    """One figure that judges rewards, for several datasets."""
 
     name: str
     meaning: str
@@ -209,7 +202,7 @@ class QualityRow:
 
 @dataclass(frozen=True)
 class QualityTable:
-    """What the rewards of several datasets are worth."""
+    """The figures that judge the rewards of several datasets."""
 
     datasets: tuple[str, ...]
     rows: tuple[QualityRow, ...]
@@ -221,7 +214,7 @@ class QualityTable:
 
 @dataclass(frozen=True)
 class Matrix:
-    """Mean score of where the episodes of each source (rows) end, by the goal of each dataset (columns)."""
+    """Mean score of the last frames of each source's episodes (rows), by the goal of each dataset (columns)."""
 
     episodes: tuple[str, ...]
     goals: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Evaluations → the episodes that a report shows, with their videos."""
+"""Evaluations → the episodes of a report, with their videos."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from zest_rl.types import FloatArray
 def representative_episodes(
     name: str, evaluation: Evaluation, scorer: StateScorer | None, film: Film
 ) -> list[EpisodePanel]:
-    """Best, median and worst episode of an evaluation: video, score over time, ground-truth progress."""
+    """Return the best, the median and the worst episode: video, score over time, ground-truth progress."""
     episodes = []
     for which, index in representative(evaluation.normalized()).items():
         states: NDArray[np.float64] = evaluation.traces["qpos"][index]
@@ -31,11 +31,11 @@ def representative_episodes(
 
 
 def paired_episodes(left: tuple[str, Evaluation], right: tuple[str, Evaluation], film: Film) -> list[EpisodePanel]:
-    """Two policies on the same start side by side: where the right one gains most, as usual, and least.
+    """Return pairs of episodes from the same start: those in which the right policy gains most, the median and least.
 
     Args:
         left: name and evaluation of one policy.
-        right: of the other; without equal starts there is nothing to pair, and the list is empty.
+        right: of the other; the list is empty if the starts differ.
         film: makes the videos.
     """
     (left_name, before), (right_name, after) = left, right

@@ -1,4 +1,4 @@
-"""A relabeled dataset → what a report shows of its goal: pictures or sentences, and how it ranks episodes."""
+"""A relabeled dataset → the pictures or sentences of its goal, and how its rewards rank episodes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from zest_rl.rewards.relabel import GOAL_FOLDER
 
 
 def goal_scatter(name: str, ds: Dataset) -> Scatter:
-    """Return by a relabeled dataset's rewards against its ground-truth return, per episode."""
+    """Plot the returns by a relabeled dataset's rewards against the ground-truth returns."""
     returns, truth = returns_of(ds.rewards()), true_returns(ds.truth())
     rho = Estimate(math.nan, math.nan, math.nan)
     if len(returns) >= MIN_EPISODES_TO_RANK:
@@ -29,18 +29,18 @@ def goal_scatter(name: str, ds: Dataset) -> Scatter:
 
 
 def return_scatter(name: str, returns: Values, truth: Values, rho: Estimate) -> Scatter:
-    """Returns (N,) by the rewards against the true ones (N,), with their rank correlation."""
+    """Plot returns (N,) by the rewards against the true ones (N,), with their rank correlation."""
     return Scatter(name, truth.astype(np.float32), returns.astype(np.float32), rho.value, (rho.low, rho.high))
 
 
 def goal_panel(name: str, made: RelabelRecord, folder: Path, scatter: Scatter | None = None) -> GoalPanel:
-    """The goal of a relabeled dataset, as pictures or sentences.
+    """Return the goal of a relabeled dataset, as pictures or sentences.
 
     Args:
-        name: what the report calls the goal.
+        name: of the goal in the report.
         made: how the dataset was relabeled.
         folder: of the dataset.
-        scatter: how the goal ranks episodes, where that is known.
+        scatter: how the goal ranks episodes, if known.
     """
     ranking = (None, 0) if scatter is None else (scatter.spearman, len(scatter.x))
     if (folder / GOAL_FOLDER).is_dir():

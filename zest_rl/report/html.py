@@ -1,6 +1,6 @@
-"""Report → one HTML file that needs no network and forbids it: style, script, images and videos are inside.
+"""Report → one HTML file that neither needs nor allows a network: style, script, images and videos are embedded.
 
-The templates escape whatever they show; markup of ours alone is `Markup`.
+The templates escape all values but our own `Markup`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ THUMBNAIL = 160
 
 
 def render_html(report: Report) -> str:
-    """Return the report as one HTML page; it reads nothing but the videos that the episodes name.
+    """Return the report as one HTML page; only the videos of the episodes are read from disk.
 
     Raises:
         BadInput: a video cannot be read or is not H.264 in MP4.
@@ -112,7 +112,7 @@ def _mp4(path: Path) -> str:
 
 
 def _sha256(text: str) -> str:
-    """Return what a Content-Security-Policy calls a style or a script by."""
+    """Return the hash that names a style or a script in a Content-Security-Policy."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
@@ -121,7 +121,7 @@ def _json(value: object) -> str:
 
 
 def _plain(value: object) -> object:
-    """Return `value` as JSON can hold it, with "–" for figures that are not finite."""
+    """Convert `value` to JSON types, with "–" for numbers that are not finite."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return _plain({f.name: getattr(value, f.name) for f in dataclasses.fields(value)})
     if isinstance(value, Mapping):

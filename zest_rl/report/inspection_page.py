@@ -1,4 +1,4 @@
-"""Inspected datasets → one page: their figures side by side, their episodes, which task each goal scores highest."""
+"""Inspected datasets → one page: figures side by side, episodes, and which task each goal scores highest."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def _quality(inspections: Mapping[str, Inspection]) -> QualityTable:
 
 
 def _scatter(name: str, inspection: Inspection) -> Scatter | None:
-    """The returns that were inspected, against the true ones."""
+    """Plot the inspected returns against the true ones."""
     if inspection.true_returns is None:
         return None
     return return_scatter(name, inspection.returns, inspection.true_returns, inspection.figures["spearman"])
@@ -97,7 +97,7 @@ def _by_view(name: str, view: EpisodeView) -> list[Curve]:
 def _pixels(name: str, view: EpisodeView) -> Scatter:
     changed, scores = view.pixel_difference[1:], view.scores[1:]
     rho = math.nan
-    if len(scores) >= MIN_EPISODES_TO_RANK:  # the interval of steps that follow each other would be far too narrow
+    if len(scores) >= MIN_EPISODES_TO_RANK:  # no interval: consecutive steps are not independent
         rho = spearman(changed.astype(np.float64), scores.astype(np.float64), n_resamples=1).value
     return Scatter(name, changed, scores, rho, x_name="mean pixel difference", y_name="ZeST score", point="step")
 

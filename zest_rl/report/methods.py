@@ -18,7 +18,7 @@ from zest_rl.runtime import artifacts
 
 @dataclass(frozen=True)
 class Method:
-    """One row of the comparison: the same training with different seeds."""
+    """One row of the comparison: one training with several seeds."""
 
     name: str
     runs: tuple[Path, ...]
@@ -28,7 +28,7 @@ class Method:
     paper: float | None = None
     """The paper's figure, in percent of the expert."""
     evaluation: EvaluationConfig | None = None
-    """Which evaluation of each run; None takes the newest."""
+    """Config of the evaluation of each run; None takes the newest evaluation."""
 
     def evaluations(self) -> list[Evaluation]:
         """Read the evaluations, one per run.
@@ -42,13 +42,13 @@ class Method:
 
 
 def methods_of_runs(runs: Sequence[Path]) -> tuple[Method, ...]:
-    """Make one method of the runs that differ in their training seed alone.
+    """Group runs that differ in their training seed alone into one method each.
 
     A method is named after its agent and goal, or as `zest adopt` named it; methods of equal name also by the settings
     in which they differ.
 
     Raises:
-        BadInput: a folder is no finished run, or two runs are the same training with the same seed.
+        BadInput: a folder is not a finished run, or two runs are the same training with the same seed.
     """
     groups: dict[str, dict[int, Path]] = {}
     described: dict[str, tuple[str, dict[str, Any]]] = {}
@@ -72,7 +72,7 @@ def read_meta(run: Path) -> dict[str, Any]:
     """Read the ``meta.json`` of a finished run.
 
     Raises:
-        BadInput: the folder is no finished run.
+        BadInput: the folder is not a finished run.
     """
     check_finished(run)
     meta: dict[str, Any] = artifacts.read_json(run / "meta.json")
@@ -80,7 +80,7 @@ def read_meta(run: Path) -> dict[str, Any]:
 
 
 def goal_name(relabel: RelabelRecord) -> str:
-    """Short name of the goal whose scores are a dataset's rewards."""
+    """Return a short name of the goal of a relabeled dataset."""
     return Path(relabel.scorer.goal).name
 
 
@@ -95,7 +95,7 @@ def latest_evaluation(run: Path) -> Evaluation:
     """Read the newest evaluation of a run.
 
     Raises:
-        BadInput: the folder is no run, or it was not evaluated.
+        BadInput: the folder is not a run, or it was not evaluated.
     """
     check_finished(run)
     results = sorted(run.glob("evaluations/*/result.json"), key=lambda path: path.stat().st_mtime)

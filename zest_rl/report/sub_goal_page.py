@@ -1,4 +1,4 @@
-"""The page of an episode that reaches several goals: all curves in one chart, and a strip of frames per sub-goal."""
+"""The page of an episode with several sub-goals: all curves in one chart, and a strip of frames per sub-goal."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from zest_rl.report.sections import DETAILS, FRAMES, SUB_GOALS, Report
 
 
 def sub_goal_report(sub_goals: Sequence[SubGoalScores], details: dict[str, object]) -> Report:
-    """Build the page: all curves in one chart, and a strip of frames per sub-goal."""
+    """Build the page of one episode."""
     steps = np.arange(len(sub_goals[0].scores), dtype=np.float32)
     order = "rise one after another, in the order of" if rise_in_order(sub_goals) else "do not rise in the order of"
-    reached = [
+    rises = [
         f"{sub_goal.name} {'never' if sub_goal.rises_at is None else f'at step {sub_goal.rises_at}'}"
         + ("" if sub_goal.done_at is None else f" (done at {sub_goal.done_at})")
         for sub_goal in sub_goals
@@ -32,6 +32,6 @@ def sub_goal_report(sub_goals: Sequence[SubGoalScores], details: dict[str, objec
     curves = (Curve(sub_goal.name, "similarity to the sub-goal", steps, sub_goal.scores) for sub_goal in sub_goals)
     return Report(
         "Similarity to each sub-goal",
-        f"The scores {order} the sub-goals: {', '.join(reached)}.",
+        f"The scores {order} the sub-goals: {', '.join(rises)}.",
         (FRAMES(strips), SUB_GOALS(curves), DETAILS(details.items())),
     )
