@@ -24,9 +24,7 @@ Kind = Literal["dataset", "method", "control"]
 def _check_equal_lengths(name: str, lengths: Mapping[str, int]) -> None:
     if len(set(lengths.values())) > 1:
         got = ", ".join(f"{array} {n}" for array, n in lengths.items())
-        raise BadInput(
-            f"{title}: {' and '.join(lengths)} must be equally long, got {got}; pass one value for each step"
-        )
+        raise BadInput(f"{name}: {' and '.join(lengths)} must be equally long, got {got}; pass one value for each step")
 
 
 @dataclass(frozen=True)
