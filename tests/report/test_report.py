@@ -132,7 +132,7 @@ def report(video: Path) -> Report:
             LEARNING_CURVES(
                 (
                     Curve("BC", "loss", steps, 1 / (1 + steps)),
-                    Curve("DT", "loss", steps, steps, steps - 1, steps + 1),
+                    Curve("DT", "loss", steps, steps, (steps - 1, steps + 1)),
                 )
             ),
             DETAILS((("config", {"lr": 1e-4, "folder": Path("runs/a")}),)),
