@@ -157,14 +157,14 @@ def test_a_lerobot_folder_whose_info_lacks_a_part_is_refused(
 
 def test_without_next_truncated_an_episode_of_lerobot_counts_as_cut(maze: list[Episode], tmp_path: Path) -> None:
     root = write_lerobot(tmp_path / "pusht", maze)
-    rows_: Any = open_source(str(root)).trajectories
-    assert [episode.terminated for episode in rows_.episodes()] == [True] * 3
+    trajectories: Any = open_source(str(root)).trajectories
+    assert [episode.terminated for episode in trajectories.episodes()] == [True] * 3
     path = root / "meta" / "info.json"
     info = json.loads(path.read_text())
     del info["features"]["next.truncated"]
     path.write_text(json.dumps(info))
-    rows_ = open_source(str(root)).trajectories
-    assert [episode.terminated for episode in rows_.episodes()] == [False] * 3
+    trajectories = open_source(str(root)).trajectories
+    assert [episode.terminated for episode in trajectories.episodes()] == [False] * 3
 
 
 @pytest.mark.parametrize("form", ["robomimic", "lerobot"])

@@ -68,11 +68,11 @@ def test_imported_arrays_that_did_not_reach_the_disk_are_noticed(
         with h5py.File(staging / reader.DATA_FILE, "r+") as file:
             file[f"episode_1/{name}"][-1] += 1
 
-    demos = open_source(str(write_robomimic(tmp_path / "lift.hdf5", maze))).trajectories
+    trajectories = open_source(str(write_robomimic(tmp_path / "lift.hdf5", maze))).trajectories
     scores = [np.zeros(length + 1, np.float32) for length in LENGTHS]
     rewards = [score[1:] for score in scores]
     with pytest.raises(ZestError, match=f"{name} of episode 1 of zest/lift-v0 was not written whole"):
-        write_scored(demos, "zest/lift-v0", rewards, scores, description="", zest={}, extra=lose)
+        write_scored(trajectories, "zest/lift-v0", rewards, scores, description="", zest={}, extra=lose)
     assert reader.list_datasets() == []
 
 

@@ -38,7 +38,7 @@ class Camera:
             raise BadInput(f"a camera needs finite numbers and a distance above 0 m, got {self}")
 
     def to_mujoco(self) -> mujoco.MjvCamera:
-        """Return the camera as MuJoCo takes it."""
+        """Return the camera as a MuJoCo object."""
         free = mujoco.MjvCamera()
         free.type = mujoco.mjtCamera.mjCAMERA_FREE
         free.lookat[:] = self.lookat
@@ -68,7 +68,7 @@ class Canvas:
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = False
 
     def draw(self, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """Draw one state, whose positions in the world are computed: (V, H, W, 3) uint8 RGB."""
+        """Draw one state after its kinematics are computed: (V, H, W, 3) uint8 RGB."""
         self._gl.make_current()
         frames = np.empty((len(self._cameras), self._rect.height, self._rect.width, 3), np.uint8)
         for frame, camera in zip(frames, self._cameras, strict=True):
@@ -93,7 +93,7 @@ class StateRenderer:
     """
 
     scene: Scene
-    """What is drawn."""
+    """The scene that is drawn."""
 
     def __init__(self, scene: Scene, cameras: tuple[Camera, ...], size: int) -> None:
         """Open a GL context for square frames of `size` pixels.

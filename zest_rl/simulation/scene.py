@@ -1,4 +1,4 @@
-"""MuJoCo models made to be drawn: what is looked at, without the parts that hide it or cost time and show nothing."""
+"""MuJoCo models for rendering only, without parts that hide the object, or cost time and show nothing."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Scene:
     """A render-only copy of a simulated model, from which parts such as the robot may be left out."""
 
     model: mujoco.MjModel
-    """It never steps."""
+    """Never stepped."""
     n_qpos: int
     """Length of a state of the simulated model."""
     visible: slice
@@ -27,7 +27,7 @@ class Scene:
     def with_joint(self, qpos: NDArray[np.float64], joint: str, position: float) -> NDArray[np.float64]:
         """Return a copy of a state (n_qpos,) with one of the scene's joints moved to `position` (rad or m).
 
-        What the model couples to the joint moves along.
+        Joints that the model couples to it move too.
         """
         model, first = self.model, self.visible.start
         mover = model.joint(joint).id

@@ -1,7 +1,7 @@
-"""Where cameras stand around an object, and which states show the same.
+"""Cameras around an object, and the grid on which states with equal frames are one.
 
 States are rounded to a grid and the *rounded* state is rendered, so a frame is a function of its key, whichever episode
-met it first.
+reaches it first.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ def ring(
     Args:
         lookat: the point, in metres.
         n_views: how many.
-        azimuths: the first and the last, in degrees; the others are spread evenly between, one stands in the middle.
-        distances: in metres; the cameras take them in turn.
-        elevations: in degrees, negative looks down; the cameras take them in turn.
+        azimuths: the first and the last, in degrees, with the others evenly between; a single view is in the middle.
+        distances: in metres; the cameras cycle through them.
+        elevations: in degrees, negative looks down; the cameras cycle through them.
 
     Raises:
         BadInput: `n_views` is below 1.
@@ -45,12 +45,12 @@ def ring(
 
 
 def on_grid(qpos: NDArray[np.float64], visible: slice, tolerance: float) -> NDArray[np.float64]:
-    """Round states to a grid and clear what no frame depends on: (N, nq) → (N, nq); equal rows, equal frames.
+    """Round states to a grid and zero what no frame depends on: (N, nq) → (N, nq); equal rows have equal frames.
 
     Args:
         qpos: (N, nq) states.
         visible: the entries that a frame depends on.
-        tolerance: of the grid, in rad or m; 0 tells all different states apart.
+        tolerance: of the grid, in rad or m; 0: no rounding.
     """
     states = np.zeros_like(qpos, dtype=np.float64)
     states[:, visible] = qpos[:, visible]
@@ -62,8 +62,7 @@ def on_grid(qpos: NDArray[np.float64], visible: slice, tolerance: float) -> NDAr
 def each_once(states: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the distinct rows in the order in which they first appear: (N, nq) → (U, nq)."""
     rows, first = np.unique(states, axis=0, return_index=True)
-    in_order: NDArray[np.float64] = rows[np.argsort(first)]
-    return in_order
+    return np.asarray(rows[np.argsort(first)])
 
 
 def state_keys(states: NDArray[np.float64]) -> list[bytes]:

@@ -1,4 +1,4 @@
-"""Robot datasets of any kind → episodes and frames. One kind of input is one file here; `open_source` tells them apart.
+"""Robot datasets of any kind → episodes and frames. One file per kind of input; `open_source` recognises the kind.
 
 | input | episodes | frames |
 |---|---|---|
@@ -51,15 +51,15 @@ def open_source(
 
     Args:
         dataset: a Minari id, or the path of a robomimic file or a LeRobot folder.
-        frames: entries with pictures, or folders with videos, one per view; empty: the only pictures there are, else
-            the recorded states.
+        frames: entries with pictures, or folders with videos, one per view; empty: the only pictures, else the
+            recorded states.
         cameras: of the environment's model, one per view, to render the recorded states from.
-        n_views: of the kitchen: cameras around the object.
-        show_robot: of the kitchen: keep the robot in view.
-        tolerance: of the kitchen: states that agree to this many rad or m are one.
+        n_views: kitchen only: cameras around the object.
+        show_robot: kitchen only: keep the robot in view.
+        tolerance: kitchen only: grid of the states, see `Views`.
 
     Raises:
-        BadInput: no such dataset, or its frames cannot be found or told apart; the message says what there is.
+        BadInput: no such dataset, or its frames are missing or ambiguous; the message lists the candidates.
     """
     with nullcontext() if _is_path(dataset) else reader.open_dataset(dataset) as ds:
         if ds is not None and ds.record.task is not None and not (frames or cameras):

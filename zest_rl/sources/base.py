@@ -1,4 +1,4 @@
-"""What every kind of input gives: frames by episode, beside the `Trajectories` that get the rewards."""
+"""What every kind of input provides: the `Trajectories` that get the rewards, and their frames."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from zest_rl.types import Frame
 
 
 class EpisodeFrames(Protocol):
-    """The frames of every episode, from one view or several. It is sent to worker processes: small, and frozen."""
+    """The frames of every episode, from one or more views. Sent to worker processes, so it is small and frozen."""
 
     @property
     def views(self) -> Sequence[str]:
         """Names of the V views, for provenance."""
 
     def describe(self) -> dict[str, Any]:
-        """Where the frames come from, JSON-ready, for provenance."""
+        """JSON-ready, for provenance: where the frames come from."""
 
     def digest(self, episode: int) -> str:
-        """64 hex digits over all that the frames of an episode depend on; embeddings are cached by it."""
+        """64 hex digits over everything that the frames of an episode depend on; the key of cached embeddings."""
 
     def read(self, episode: int) -> Iterator[Sequence[Frame]]:
-        """Yield the V frames of x_0, x_1, …, each (H, W, 3) uint8 RGB, holding few in memory.
+        """Yield the V frames of x_0, x_1, …, each (H, W, 3) uint8 RGB, with few in memory.
 
-        T + 1 of them, or T: then x_T is taken to look like x_{T-1}.
+        T + 1 steps, or T: then x_T repeats x_{T-1}.
         """
 
 

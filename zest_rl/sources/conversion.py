@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,14 +23,14 @@ class ConvertedEpisode:
     """One episode of T steps."""
 
     obs: dict[str, FloatArray]
-    """(T+1, n) float32 each, no pictures; where the last was not recorded, it repeats the one before."""
+    """(T+1, n) float32 each, no pictures; o_T repeats o_{T-1} where it was not recorded."""
     actions: FloatArray
     """(T, act_dim) float32."""
     rewards: FloatArray
     """(T,) float32, NaN where none were recorded."""
     terminated: bool
     success: NDArray[np.bool_] | None = None
-    """(T,) whether the task was done after each action; None where that was not recorded."""
+    """(T,) success after each action; None where it was not recorded."""
 
     def __post_init__(self) -> None:
         n_steps = len(self.actions)
@@ -45,29 +45,59 @@ class ConvertedEpisode:
             raise BadInput("an episode must hold numbers among its observations, for a policy to act on; got none")
 
 
-def dataset_id_of(path: Path) -> str:
-    """Return ``zest/NAME-v0`` for a file or folder."""
-    name = re.sub(r"[^A-Za-z0-9_.]+", "-", path.stem if path.is_file() else path.name).strip("-._")
-    return f"zest/{name or 'dataset'}-v0"
+@dataclass(frozen=True)
+class ConvertedTrajectories:
+    """The `Trajectories` of a file or folder in another format; its pictures or videos are not copied."""
 
+    path: Path
+    format: str
+    """Name of the format."""
+    n_steps: tuple[int, ...]
+    """T of every episode."""
+    n_bytes: int
+    """Approximate size of all numbers."""
+    episodes: Callable[[], Iterator[ConvertedEpisode]]
+    """Reads all episodes, a few in memory at a time; picklable."""
+    fps: float | None = None
+    """Steps per second, which the copy keeps; None where they are not recorded."""
 
-def fingerprint(episodes: Iterable[ConvertedEpisode]) -> str:
-    """Hash all that training may see of the episodes, and success where it is kept, but no rewards."""
-    return artifacts.hash_json(
-        [
+    @property
+    def dataset_id(self) -> str:
+        """``zest/NAME-v0``, from the name of the file or folder."""
+        name = self.path.stem if self.path.is_file() else self.path.name
+        return f"zest/{re.sub(r'[^A-Za-z0-9_.]+', '-', name).strip('-._') or 'dataset'}-v0"
+
+    def fingerprint(self) -> str:
+        """Hash everything that training may see, except rewards, and what else the copy keeps: success and `fps`."""
+        digest = artifacts.hash_json(
             [
-                sorted(episode.obs),
-                artifacts.hash_arrays(*(episode.obs[name] for name in sorted(episode.obs)), episode.actions),
-                episode.terminated,
-                *([] if episode.success is None else [artifacts.hash_arrays(episode.success)]),
+                [
+                    sorted(episode.obs),
+                    artifacts.hash_arrays(*(episode.obs[name] for name in sorted(episode.obs)), episode.actions),
+                    episode.terminated,
+                    *([] if episode.success is None else [artifacts.hash_arrays(episode.success)]),
+                ]
+                for episode in self.episodes()
             ]
-            for episode in episodes
-        ]
-    )
+        )
+        return digest if self.fps is None else artifacts.hash_json([digest, self.fps])
+
+    def rewards_to_keep(self) -> Sequence[FloatArray | None]:
+        """Read the original rewards."""
+        return [episode.rewards for episode in self.episodes()]
+
+    def fill(self, folder: Path) -> None:
+        """Write the episodes as a Minari dataset."""
+        description = f"Imported from {self.path.name} ({self.format})."
+        write_converted(folder, self.dataset_id, self.episodes(), description, fps=self.fps)
+
+    def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
+        """Yield the arrays of each episode, without rewards."""
+        return map(arrays_on_disk, self.episodes())
 
 
-def stored(episode: ConvertedEpisode) -> dict[str, NDArray[Any]]:
-    """Return what `write_converted` writes of an episode but its rewards, under the names on disk."""
+def arrays_on_disk(episode: ConvertedEpisode) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an episode, without its rewards, by the names that `write_converted` gives them."""
     last = np.arange(len(episode.actions)) == len(episode.actions) - 1
     success = {} if episode.success is None else {SOURCE_SUCCESS: np.concatenate([[False], episode.success])}
     return {
@@ -98,7 +128,7 @@ def write_converted(
             storage = MinariStorage.new(
                 folder / "data", observation_space=observation_space, action_space=space(episode.actions)
             )
-        arrays = stored(episode)
+        arrays = arrays_on_disk(episode)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             storage.update_episodes(

@@ -19,7 +19,7 @@ from zest_rl.types import Frame
 
 @dataclass(frozen=True, eq=False)
 class KitchenStates:
-    """`EpisodeFrames` of the kitchen's states. Equal states have equal frames, so that each need be seen but once."""
+    """`EpisodeFrames` of the kitchen's states. Equal states have equal frames, so each is rendered once."""
 
     states: Sequence[NDArray[np.float64]]
     """(T+1, nq) simulator positions of every episode."""
@@ -27,11 +27,11 @@ class KitchenStates:
 
     @property
     def views(self) -> Sequence[str]:
-        """Where each camera stands."""
+        """Pose of each camera."""
         return [f"azimuth {c.azimuth:g}°, elevation {c.elevation:g}°, {c.distance:g} m" for c in self.ring.cameras]
 
     def describe(self) -> dict[str, Any]:
-        """Tell what was rendered how."""
+        """The views that are rendered."""
         return {"kind": "kitchen", "views": list(self.views), "ring": asdict(self.ring)}
 
     def digest(self, episode: int) -> str:
@@ -47,11 +47,11 @@ class KitchenStates:
 
 
 def kitchen_source(dataset_id: str, ring: Views) -> Source:
-    """Read a dataset of the kitchen, to be seen from a ring of views; raises as `Dataset.states`."""
+    """Open a dataset of the kitchen, seen from a ring of views; raises as `Dataset.states`."""
     with open_dataset(dataset_id) as ds:
         return read_kitchen(ds, ring)
 
 
 def read_kitchen(ds: Dataset, ring: Views) -> Source:
-    """Read a dataset that is open; as `kitchen_source`."""
+    """As `kitchen_source`, for an open dataset."""
     return Source(DatasetCopy.of(ds), KitchenStates(ds.states(), ring))

@@ -9,8 +9,8 @@ Layout: https://huggingface.co/docs/lerobot/lerobot-dataset-v3, read without the
     videos/KEY/chunk-000/file-000.mp4               one camera
 
 An episode has T rows and T frames, o_0 … o_{T-1}; o_T, which is not recorded, repeats o_{T-1}. LeRobot's ``next.done``
-marks the last frame whatever ended the episode, so an episode counts as terminated when its last ``next.done`` is true
-and its last ``next.truncated`` false; where either is not recorded, as cut by a time limit.
+marks the last frame of every episode, so an episode counts as terminated if its last ``next.done`` is true and its
+last ``next.truncated`` is false, and as truncated where either is not recorded.
 """
 
 from __future__ import annotations
@@ -18,96 +18,60 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
-from numpy.typing import NDArray
 
 from zest_rl.data.observations import choose_pictures
 from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
-from zest_rl.sources import conversion
-from zest_rl.sources.conversion import ConvertedEpisode
+from zest_rl.sources.conversion import ConvertedEpisode, ConvertedTrajectories
 from zest_rl.types import FloatArray, Frame
 
 INFO = Path("meta", "info.json")
 _NUMBERS = ("float16", "float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool")
-
 _OTHERS = ("action", "next.reward", "next.done", "next.truncated", "next.success")
 
 
-@dataclass(frozen=True)
-class Rows:
-    """The `Trajectories` of a LeRobot folder; videos are left where they are."""
+def read_episodes(
+    root: Path, files: Sequence[tuple[str, Sequence[int]]], n_steps: Sequence[int], columns: Sequence[str]
+) -> Iterator[ConvertedEpisode]:
+    """Read one data file at a time; LeRobot limits each to 100 MB.
 
-    root: Path
-    files: tuple[tuple[str, tuple[int, ...]], ...]
-    """Data files, relative to the root, with the ``episode_index`` of each that is read from it, in order."""
-    n_steps: tuple[int, ...]
-    """T of every episode."""
-    observed: tuple[str, ...]
-    """Columns with numbers that are observed."""
-    others: tuple[str, ...]
-    """Those of `_OTHERS` that there are."""
-    fps: float
-    """Steps per second."""
+    Args:
+        root: the dataset's folder.
+        files: data files, relative to the root, each with the ``episode_index`` of the episodes read from it, in order.
+        n_steps: T of every episode.
+        columns: observed numbers, and those of `_OTHERS` in the dataset.
+    """
+    import pyarrow.compute
+    import pyarrow.parquet
 
-    @property
-    def dataset_id(self) -> str:
-        """Made of the folder's name."""
-        return conversion.dataset_id_of(self.root)
+    lengths = iter(n_steps)
+    for file, members in files:
+        table = pyarrow.parquet.read_table(root / file, columns=["episode_index", *columns])
+        for episode in members:
+            rows = table.filter(pyarrow.compute.equal(table["episode_index"], episode))
+            if len(rows) != (length := next(lengths)):
+                raise BadInput(
+                    f"{root / file} has {len(rows)} rows of episode {episode}, but meta/episodes says {length}; "
+                    "download the dataset again"
+                )
+            yield _converted({name: _column(rows[name]) for name in columns})
 
-    @property
-    def n_bytes(self) -> int:
-        """Of the parquet files, which are compressed by less than this."""
-        return 4 * sum((self.root / file).stat().st_size for file, _ in self.files)
 
-    def fingerprint(self) -> str:
-        """Hash observations, actions and ends, and the frame rate, which the copy keeps."""
-        return artifacts.hash_json([conversion.fingerprint(self.episodes()), self.fps])
-
-    def rewards_to_keep(self) -> Sequence[FloatArray | None]:
-        """Read the rewards that the episodes came with."""
-        return [episode.rewards for episode in self.episodes()]
-
-    def fill(self, folder: Path) -> None:
-        """Write them as a Minari dataset."""
-        description = f"Imported from {self.root.name} (LeRobot)."
-        conversion.write_converted(folder, self.dataset_id, self.episodes(), description, fps=self.fps)
-
-    def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
-        """Yield what is written of each episode."""
-        return map(conversion.stored, self.episodes())
-
-    def episodes(self) -> Iterator[ConvertedEpisode]:
-        """Read one file at a time, which LeRobot keeps at 100 MB."""
-        import pyarrow.compute
-        import pyarrow.parquet
-
-        lengths = iter(self.n_steps)
-        for file, members in self.files:
-            path = self.root / file
-            table = pyarrow.parquet.read_table(path, columns=["episode_index", *self.observed, *self.others])
-            for episode in members:
-                rows = table.filter(pyarrow.compute.equal(table["episode_index"], episode))
-                if len(rows) != (length := next(lengths)):
-                    raise BadInput(
-                        f"{path} has {len(rows)} rows of episode {episode}, but meta/episodes says {length}; download "
-                        "the dataset again"
-                    )
-                yield self._episode({name: _column(rows[name]) for name in (*self.observed, *self.others)})
-
-    def _episode(self, columns: Mapping[str, FloatArray]) -> ConvertedEpisode:
-        obs = {name: np.concatenate([columns[name], columns[name][-1:]]) for name in self.observed}
-        n_steps = len(columns["action"])
-        rewards = columns.get("next.reward", np.full((n_steps, 1), np.nan, np.float32))[:, 0]
-        done, truncated = (columns.get(f"next.{end}") for end in ("done", "truncated"))
-        terminated = done is not None and truncated is not None and bool(done[-1, 0] and not truncated[-1, 0])
-        success = columns["next.success"][:, 0] > 0 if "next.success" in columns else None
-        return ConvertedEpisode(obs, columns["action"], rewards, terminated, success)
+def _converted(columns: Mapping[str, FloatArray]) -> ConvertedEpisode:
+    observed = {name: values for name, values in columns.items() if name not in _OTHERS}
+    obs = {name: np.concatenate([values, values[-1:]]) for name, values in observed.items()}
+    rewards = columns.get("next.reward", np.full((len(columns["action"]), 1), np.nan, np.float32))[:, 0]
+    done, truncated = (columns.get(f"next.{end}") for end in ("done", "truncated"))
+    terminated = done is not None and truncated is not None and bool(done[-1, 0] and not truncated[-1, 0])
+    success = columns["next.success"][:, 0] > 0 if "next.success" in columns else None
+    return ConvertedEpisode(obs, columns["action"], rewards, terminated, success)
 
 
 def _column(values: Any) -> FloatArray:
@@ -119,7 +83,7 @@ def _column(values: Any) -> FloatArray:
 
 @dataclass(frozen=True)
 class Span:
-    """Where a view of an episode stands in a video."""
+    """Part of a video that shows one view of one episode."""
 
     path: Path
     start: float
@@ -137,22 +101,22 @@ class Videos:
     """Per episode, per view."""
 
     def describe(self) -> dict[str, Any]:
-        """Tell which cameras the frames are of, and how they align."""
+        """The cameras, and the alignment of frames and steps."""
         return {"kind": "videos", "views": list(self.views), "alignment": "frame t is x_t; x_T repeats x_{T-1}"}
 
     def digest(self, episode: int) -> str:
-        """Hash the videos and the places in them."""
+        """Hash the videos and the spans in them."""
         spans = self.spans[episode]
         return artifacts.hash_json([[_hash_video(s.path), s.start, s.n_frames, self.fps] for s in spans])
 
     def read(self, episode: int) -> Iterator[Sequence[Frame]]:
-        """Decode the views side by side."""
+        """Decode all views in step."""
         return zip(*(_decode(span, self.fps) for span in self.spans[episode]), strict=False)
 
 
 @functools.cache
 def _hash_video(path: Path) -> str:
-    return artifacts.hash_file(path)  # once, though many episodes are in it
+    return artifacts.hash_file(path)  # cached, since a video holds many episodes
 
 
 def _decode(span: Span, fps: float) -> Iterator[Frame]:
@@ -172,23 +136,25 @@ def _decode(span: Span, fps: float) -> Iterator[Frame]:
 
 
 def is_lerobot(folder: Path) -> bool:
-    """Whether a folder is laid out as a LeRobot dataset, of any version."""
+    """Whether a folder has the layout of a LeRobot dataset of any version."""
     return (folder / INFO).is_file()
 
 
-def open_lerobot(root: Path, keys: Sequence[str], *, with_frames: bool = True) -> tuple[Rows, Videos | None]:
+def open_lerobot(
+    root: Path, keys: Sequence[str], *, with_frames: bool = True
+) -> tuple[ConvertedTrajectories, Videos | None]:
     """Open a LeRobot folder.
 
     Args:
         root: the folder.
-        keys: which features are the frames, one per view; empty: the only video there is.
+        keys: features that are the frames, one per view; empty: the only video.
         with_frames: False where the frames are elsewhere.
 
     Returns:
-        The episodes; and their videos, None where there are none, or they are not asked for.
+        The episodes; and their videos, None without any or without `with_frames`.
 
     Raises:
-        BadInput: another version, pyarrow is not installed, a file is missing, or the videos cannot be told apart.
+        BadInput: another version, pyarrow is not installed, a file is missing, or the choice of videos is ambiguous.
     """
     info = artifacts.read_json(root / INFO)
     version = str(info.get("codebase_version"))
@@ -211,8 +177,10 @@ def open_lerobot(root: Path, keys: Sequence[str], *, with_frames: bool = True) -
             for name, facts in features.items()
             if name.startswith("observation") and facts["dtype"] in _NUMBERS and len(facts["shape"]) <= 1
         )
-        places = [f"videos/{view}/{part}" for view in views for part in ("chunk_index", "file_index", "from_timestamp")]
-        columns = ["episode_index", "length", "data/chunk_index", "data/file_index", *places]
+        video_columns = [
+            f"videos/{view}/{part}" for view in views for part in ("chunk_index", "file_index", "from_timestamp")
+        ]
+        columns = ["episode_index", "length", "data/chunk_index", "data/file_index", *video_columns]
         parts = [pyarrow.parquet.read_table(p, columns=columns) for p in sorted(root.glob("meta/episodes/*/*.parquet"))]
         episodes = sorted((row for part in parts for row in part.to_pylist()), key=lambda row: row["episode_index"])
         n_steps = tuple(int(row["length"]) for row in episodes)
@@ -242,8 +210,10 @@ def open_lerobot(root: Path, keys: Sequence[str], *, with_frames: bool = True) -
     others = tuple(name for name in _OTHERS if name in features)
     if "action" not in others:
         raise BadInput(f"{root} has no feature 'action', got {', '.join(features)}")
-    rows_ = Rows(root, files, n_steps, observed, others, fps)
-    return rows_, Videos(tuple(views), fps, spans) if views else None
+    n_bytes = 4 * sum((root / file).stat().st_size for file, _ in files)  # parquet compresses by less than that
+    read = partial(read_episodes, root, files, n_steps, (*observed, *others))
+    trajectories = ConvertedTrajectories(root, "LeRobot", n_steps, n_bytes, read, fps)
+    return trajectories, Videos(tuple(views), fps, spans) if views else None
 
 
 def _path(template: str, row: Mapping[str, Any], where: str, video_key: str = "") -> str:

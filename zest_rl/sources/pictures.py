@@ -1,4 +1,4 @@
-"""Pictures that HDF5 files hold beside the episodes: Minari's image observations, robomimic's ``*_image``."""
+"""Pictures in the HDF5 files of the episodes: Minari's image observations, robomimic's ``*_image``."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Pictures:
     """Paths of entries whose last row is x_T, one per view, where `views` end with x_{T-1}."""
 
     def describe(self) -> dict[str, Any]:
-        """Tell which entries are the frames."""
+        """The entries that are the frames."""
         return {"kind": "pictures", "views": list(self.views), "last_frame_from": list(self.lasts)}
 
     def digest(self, episode: int) -> str:
-        """Hash the rows as they are stored."""
+        """Hash the stored rows."""
         with h5py.File(self.file, "r") as file:
             group = file[self.episodes[episode]]
             parts = (part for view in self.views for part in stored_rows(group[view]))
@@ -50,6 +50,6 @@ class Pictures:
 
 
 def picture_entries(file: Path, group: str) -> dict[str, int | None]:
-    """Return the entries below a group with their numbers of channels; None where an entry is no picture."""
+    """Return the `n_channels` of all entries below a group."""
     with h5py.File(file, "r") as opened:
         return {name: n_channels(entry) for name, entry in entries(opened[group]).items()}

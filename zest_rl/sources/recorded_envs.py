@@ -1,6 +1,6 @@
-"""What is known of other packages' environments: where their state is recorded, and how it is put back to be drawn.
+"""Environments of other packages: where their datasets record the state, and how it is restored for rendering.
 
-One row of `RECORDED_ENVS` is one environment; of one that has no row, the recorded ``qpos`` is all there is to draw.
+One row of `RECORDED_ENVS` is one environment; without a row only the recorded ``qpos`` is restored.
 """
 
 from __future__ import annotations
@@ -16,35 +16,35 @@ from numpy.typing import NDArray
 
 Doubles = NDArray[np.float64]
 Columns = tuple[tuple[str, int, int | None], ...]
-"""Paths within an episode and which of their columns make up qpos, in order: from the first number to before the
+"""Paths within an episode and the columns that make up qpos, in order: from the first number up to, but without, the
 second; None: to the end."""
 State = Mapping[str, Doubles]
-"""``qpos`` (nq,), and by its last name all else that is put into the scene."""
+"""``qpos`` (nq,), and everything else in the scene by the last part of its path."""
 
 
 @dataclass(frozen=True)
 class RecordedEnv:
-    """How the states of one environment, or of several alike, are recorded."""
+    """How the states of an environment, or of similar ones, are recorded."""
 
     prefix: str
     """Start of the entry points."""
     qpos: Columns | None = None
-    """Where qpos stands in what is observed; None: it is not there to the bit."""
+    """Columns of the observations that hold qpos; None: they do not hold it exactly."""
     put: Callable[[Any, State], None] | None = None
-    """Puts a state into the environment; None: qpos is all that a frame depends on."""
+    """Restores a state in the environment; None: a frame depends on qpos alone."""
     scenery: Callable[[Any], tuple[str, ...]] = lambda env: ()
-    """Environment → paths of what `put` takes besides qpos; ``{folder}`` is the group that qpos is recorded in."""
+    """Environment → paths of what `put` needs besides qpos; ``{folder}`` is the group in which qpos is recorded."""
     noise: tuple[str, ...] = ()
-    """Arguments of the environment that, unless they are 0, blur what it observes."""
+    """Arguments of the environment that add noise to its observations unless they are 0."""
 
     def observed_qpos(self, kwargs: Mapping[str, Any]) -> Columns | None:
-        """Return where qpos stands in the observations of an environment that was made with `kwargs`."""
+        """Return the columns of qpos in the observations of an environment made with `kwargs`."""
         if self.qpos is None or kwargs.get("exclude_current_positions_from_observation", True):
             return self.qpos
         return (("observations", 0, sum((end or 0) - first for _, first, end in self.qpos)),)
 
     def put_state(self, env: Any, state: State) -> None:
-        """Put a recorded state into the environment; positions in the world are not computed yet."""
+        """Restore a recorded state in the environment, without computing positions in the world."""
         if self.put is None:
             env.data.qpos[:] = state["qpos"]
         else:
@@ -52,8 +52,8 @@ class RecordedEnv:
 
 
 def _put_hand(env: Any, state: State) -> None:
-    known = {name: state[name] for name in env._state_space.spaces if name != "qvel"}
-    env.set_env_state({**known, "qvel": np.zeros(env.model.nv)})
+    recorded = {name: state[name] for name in env._state_space.spaces if name != "qvel"}
+    env.set_env_state({**recorded, "qvel": np.zeros(env.model.nv)})
 
 
 def _hand_scenery(env: Any) -> tuple[str, ...]:
@@ -69,9 +69,9 @@ def _put_maze(env: Any, state: State) -> None:
 def _put_fetch(env: Any, state: State) -> None:
     env.data.qpos[:] = state["qpos"]
     mujoco.mj_forward(env.model, env.data)
-    env._utils.reset_mocap2body_xpos(env.model, env.data)  # faint lines that lead the gripper
+    env._utils.reset_mocap2body_xpos(env.model, env.data)  # draws the faint lines that lead the gripper
     env.goal = state["desired_goal"]
-    env._render_callback()  # what it does before each frame of its own: the target goes where the goal is
+    env._render_callback()  # which env.render() calls: it moves the target to the goal
 
 
 def _goal(env: Any) -> tuple[str, ...]:
@@ -103,9 +103,9 @@ RECORDED_ENVS = (
     # by default its observations are off by up to 0.001 rad, and 0.00005 rad or m
     RecordedEnv(f"{_ROBOTICS}franka_kitchen", _KITCHEN, noise=("robot_noise_ratio", "object_noise_ratio")),
 )
-"""The first row whose prefix fits counts. The columns hold qpos to the bit, but for noise."""
+"""The first row whose prefix matches counts. Apart from noise, the columns hold qpos exactly."""
 
 
 def recorded_env(entry_point: str) -> RecordedEnv:
-    """Return what is known of an environment."""
+    """Return the row of an environment, or a default one."""
     return next((row for row in RECORDED_ENVS if entry_point.startswith(row.prefix)), RecordedEnv(entry_point))

@@ -1,69 +1,31 @@
 """robomimic's HDF5 files: ``data/demo_I`` with ``obs/``, ``actions``, ``rewards``, ``dones`` and mostly ``next_obs/``.
 
 Layout: https://robomimic.github.io/docs/datasets/overview.html. obs/KEY has T rows, o_0 … o_{T-1}; o_T is the
-last row of next_obs/KEY, and where there is no next_obs it repeats o_{T-1}. An episode counts as terminated when its
-last ``terminals`` is 1, which `zest export` records; without it, its last ``dones``; and else as cut by the horizon.
+last row of next_obs/KEY, or repeats o_{T-1} where there is no next_obs. An episode counts as terminated if the last of
+its ``terminals`` is 1, which `zest export` records; without these, of its ``dones``; without either it is truncated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from zest_rl.data.observations import choose_pictures, entries, is_numbers
 from zest_rl.errors import BadInput
-from zest_rl.sources import conversion
-from zest_rl.sources.conversion import ConvertedEpisode
+from zest_rl.sources.conversion import ConvertedEpisode, ConvertedTrajectories
 from zest_rl.sources.pictures import Pictures, picture_entries
 from zest_rl.types import FloatArray
 
 
-@dataclass(frozen=True)
-class Demos:
-    """The `Trajectories` of a robomimic file; pictures are left where they are."""
-
-    file: Path
-    names: tuple[str, ...]
-    """Groups of the episodes: data/demo_0, …"""
-    n_steps: tuple[int, ...]
-    """T of every episode."""
-    n_bytes: int
-    """Of all numbers, about."""
-
-    @property
-    def dataset_id(self) -> str:
-        """Made of the file's name."""
-        return conversion.dataset_id_of(self.file)
-
-    def fingerprint(self) -> str:
-        """Hash observations, actions and ends."""
-        return conversion.fingerprint(self.episodes())
-
-    def rewards_to_keep(self) -> Sequence[FloatArray | None]:
-        """Read the rewards that the episodes came with."""
-        return [episode.rewards for episode in self.episodes()]
-
-    def fill(self, folder: Path) -> None:
-        """Write them as a Minari dataset."""
-        conversion.write_converted(
-            folder, self.dataset_id, self.episodes(), f"Imported from {self.file.name} (robomimic)."
-        )
-
-    def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
-        """Yield what is written of each episode."""
-        return map(conversion.stored, self.episodes())
-
-    def episodes(self) -> Iterator[ConvertedEpisode]:
-        """Read one episode at a time."""
-        with h5py.File(self.file, "r") as file:
-            for name in self.names:
-                yield _read(file[name])
+def read_episodes(path: Path, names: Sequence[str]) -> Iterator[ConvertedEpisode]:
+    """Read one episode at a time, from groups such as ``data/demo_0``."""
+    with h5py.File(path, "r") as file:
+        for name in names:
+            yield _read(file[name])
 
 
 def _read(demo: h5py.Group) -> ConvertedEpisode:
@@ -83,19 +45,21 @@ def _read(demo: h5py.Group) -> ConvertedEpisode:
         raise BadInput(f"{demo.name}: {error}") from error
 
 
-def open_robomimic(path: Path, keys: Sequence[str], *, with_frames: bool = True) -> tuple[Demos, Pictures | None]:
+def open_robomimic(
+    path: Path, keys: Sequence[str], *, with_frames: bool = True
+) -> tuple[ConvertedTrajectories, Pictures | None]:
     """Open a robomimic file.
 
     Args:
         path: the file.
-        keys: which entries of obs/ are the frames, one per view; empty: the only pictures there are.
+        keys: entries of obs/ that are the frames, one per view; empty: the only pictures.
         with_frames: False where the frames are elsewhere.
 
     Returns:
-        The episodes; and their pictures, None where there are none, or they are not asked for.
+        The episodes; and their pictures, None without any or without `with_frames`.
 
     Raises:
-        BadInput: another kind of file, no demos, or its pictures cannot be told apart.
+        BadInput: another kind of file, no demos, or the choice of pictures is ambiguous.
     """
     try:
         with h5py.File(path, "r") as file:
@@ -117,12 +81,13 @@ def open_robomimic(path: Path, keys: Sequence[str], *, with_frames: bool = True)
     except OSError as error:
         raise BadInput(f"{path} cannot be read as HDF5 ({error}); relabel takes robomimic's files") from error
     pictures = picture_entries(path, f"{names[0]}/obs")
-    demos_ = Demos(path.resolve(), tuple(names), n_steps, n_bytes)
+    read = partial(read_episodes, path.resolve(), names)
+    trajectories = ConvertedTrajectories(path.resolve(), "robomimic", n_steps, n_bytes, read)
     if not with_frames or not (keys or any(pictures.values())):
-        return demos_, None
+        return trajectories, None
     chosen = choose_pictures(pictures, keys, str(path), "obs")
     after = tuple(f"next_obs/{key}" for key in chosen)
     with h5py.File(path, "r") as file:
         has_last = all(key in file[name] for key in after for name in names)
     views = tuple(f"obs/{key}" for key in chosen)
-    return demos_, Pictures(path.resolve(), tuple(names), views, after if has_last else ())
+    return trajectories, Pictures(path.resolve(), tuple(names), views, after if has_last else ())

@@ -1,7 +1,7 @@
-"""An environment of another package, made to draw states that it once had: its model, and cameras that look at it.
+"""An environment of another package as a renderer of recorded states: its model, and cameras that look at it.
 
-A frame is drawn as the kitchen's are: no shadows, reflections, multisampling or sky. Only registered environments are
-made, without their wrappers.
+Frames are drawn like the kitchen's: without shadows, reflections, multisampling or sky. Only registered environments
+are made, without their wrappers.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Stage:
         visual.quality.shadowsize = visual.quality.offsamples = 0
         self._recorded = recorded_env(entry_point)
         self.scenery = self._recorded.scenery(env)
-        """Paths of what `render` takes besides qpos, see `RecordedEnv`."""
+        """Paths of what `render` needs besides qpos, see `RecordedEnv`."""
         if self._recorded.put is None and hasattr(env, "_render_callback"):
             raise BadInput(
                 f"{entry_point} places targets only while it renders, in a way that is not known here; give --frames "
@@ -64,9 +64,9 @@ class Stage:
         self._canvas.hide_sky()
 
     def default_pose(self, state: State) -> Pose:
-        """Return where the camera of ``env.render()`` stands if this state is the first that it shows.
+        """Return the pose of the camera of ``env.render()`` if this state is the first that it shows.
 
-        As Gymnasium's `OffScreenViewer` and `MujocoRenderer` place it: it stays there, whatever moves.
+        As in Gymnasium's `OffScreenViewer` and `MujocoRenderer`; the camera does not follow what moves.
         """
         self._put(state)
         camera = mujoco.MjvCamera()
@@ -80,7 +80,7 @@ class Stage:
         return (x, y, z), camera.distance, camera.azimuth, camera.elevation
 
     def render(self, state: State, pose: Pose | None = None) -> list[Frame]:
-        """Draw one state: one (H, W, 3) frame per camera; `pose` is of the environment's default camera."""
+        """Draw one state: one (H, W, 3) frame per camera; `pose` is that of the default camera."""
         self._put(state)
         if pose is not None:
             self._default.lookat, self._default.distance, self._default.azimuth, self._default.elevation = pose
@@ -111,7 +111,7 @@ def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
     if plugin is not None and spec.id not in gymnasium.registry:
         state_plugins.load(plugin)  # its module registers the environment
     check_registered(spec)
-    spec.additional_wrappers = ()  # what they change is not shown, and they are code
+    spec.additional_wrappers = ()  # they change nothing that is rendered, and would run code
     try:
         with redirect_stderr(StringIO()):  # on import gymnasium_robotics prints news of its other environments
             env: Any = gymnasium.make(spec, disable_env_checker=True).unwrapped
@@ -128,7 +128,7 @@ def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
 
 
 def _renderer_of(env: Any) -> Any:
-    """Return Gymnasium's renderer of an environment, or of the one that it is built on; None: it has none."""
+    """Return Gymnasium's renderer of an environment or of the one inside it; None without any."""
     inner = (getattr(env, part, None) for part in ("point_env", "ant_env", "robot_env"))
     renderers = (getattr(part, "mujoco_renderer", None) for part in (env, *inner))
     return next((renderer for renderer in renderers if renderer is not None), None)

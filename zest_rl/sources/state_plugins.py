@@ -1,4 +1,4 @@
-"""Simulator states of somebody else's environment, rebuilt from what it observes by a function of their package."""
+"""Simulator states of third-party environments, rebuilt from observations by a function of their package."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ENTRY_POINTS = "zest_rl.state_renderers"
 
 
 def registered(env_id: str) -> importlib.metadata.EntryPoint | None:
-    """Return which function rebuilds the states of an environment; that it is installed makes its code trusted."""
+    """Return the entry point of the function for an environment; an installed package is trusted."""
     return next((e for e in importlib.metadata.entry_points(group=ENTRY_POINTS) if e.name == env_id), None)
 
 
@@ -31,7 +31,7 @@ def load(entry: importlib.metadata.EntryPoint) -> Callable[[Mapping[str, NDArray
     """
     try:
         function: Callable[[Mapping[str, NDArray[Any]]], NDArray[Any]] = entry.load()
-    except Exception as error:  # whatever somebody else's module raises
+    except Exception as error:  # anything that third-party code raises
         raise ZestError(
             f"{entry.value}, which is registered for {entry.name}, cannot be loaded ({type(error).__name__}: {error})"
         ) from error
@@ -42,7 +42,7 @@ def rebuild(entry: importlib.metadata.EntryPoint, episode: h5py.Group, n_rows: i
     """Return qpos (T+1, nq) of an episode in a Minari dataset.
 
     Raises:
-        ZestError: the function fails, or returns anything else.
+        ZestError: the function fails, or its result is not finite or has another shape.
     """
     build = load(entry)
     parts = [entries(episode[part], part) for part in ("observations", "infos") if part in episode]
@@ -51,7 +51,7 @@ def rebuild(entry: importlib.metadata.EntryPoint, episode: h5py.Group, n_rows: i
         qpos = np.asarray(build(numbers), np.float64)
         if qpos.ndim != 2 or len(qpos) != n_rows or not np.isfinite(qpos).all():
             raise ValueError(f"qpos must be finite and of shape ({n_rows}, nq), got {qpos.shape}")
-    except Exception as error:  # whatever somebody else's function raises
+    except Exception as error:  # anything that third-party code raises
         raise ZestError(
             f"{entry.value}, which is registered for {entry.name}, failed ({type(error).__name__}: {error})"
         ) from error

@@ -1,8 +1,8 @@
 """Recorded simulator states of a Gymnasium environment → frames, rendered from the environment's own model.
 
-A frame shows the state exactly where all that moves is in qpos, or is known to `zest_rl.sources.recorded_envs`: targets
-and furniture that an environment puts elsewhere in each episode. Only environments that `zest_rl.data.env_specs`
-trusts, or that a plugin (`zest_rl.sources.state_plugins`) brings, are made.
+A frame is exact if everything that moves is in qpos or listed in `zest_rl.sources.recorded_envs`, such as targets and
+furniture that an environment places anew in each episode. Only environments that `zest_rl.data.env_specs` trusts, or
+that have a plugin (`zest_rl.sources.state_plugins`), are made.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _DEFAULT_CAMERA = "the environment's own camera"
 
 @dataclass(frozen=True)
 class States:
-    """`EpisodeFrames` rendered from what is recorded of the simulator in a Minari dataset."""
+    """`EpisodeFrames` rendered from the simulator states in a Minari dataset."""
 
     file: Path
     episodes: tuple[str, ...]
@@ -43,13 +43,13 @@ class States:
     qpos: Columns
     """Empty: a plugin rebuilds it (`state_plugins`)."""
     scenery: tuple[str, ...]
-    """Paths of what else is put into the scene."""
+    """Paths of everything else in the scene."""
     cameras: tuple[str, ...] = ()
-    """Of the model; empty: where the environment's default camera stands."""
+    """Of the model; empty: the environment's default camera."""
     pose: Pose | None = None
-    """Of that camera; None where it is one of the model."""
+    """Of the default camera; None where it is a camera of the model."""
     noisy: bool = False
-    """Whether the observations that qpos is read from were blurred."""
+    """Whether the observations from which qpos is read have noise."""
 
     @property
     def views(self) -> Sequence[str]:
@@ -57,7 +57,7 @@ class States:
         return self.cameras or (_DEFAULT_CAMERA,)
 
     def describe(self) -> dict[str, Any]:
-        """Tell what was rendered how."""
+        """Where the states come from, and how they are rendered."""
         return {
             "kind": "states",
             "views": list(self.views),
@@ -84,7 +84,7 @@ class States:
             yield stage.render({name: values[step] for name, values in recorded.items()}, self.pose)
 
     def read_states(self, episode: int) -> dict[str, Doubles]:
-        """Read ``qpos`` (T+1, nq), and by its last name all else that is put into the scene (T+1, n)."""
+        """Read ``qpos`` (T+1, nq), and everything else in the scene (T+1, n) by the last part of its path."""
         with h5py.File(self.file, "r") as file:
             group = file[self.episodes[episode]]
             n_rows = len(group["actions"]) + 1
@@ -114,7 +114,7 @@ def _rows(group: h5py.Group, path: str, n_rows: int) -> Doubles:
 
 
 def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, cameras: Sequence[str], what: str) -> States:
-    """Find what a Minari dataset records of the simulator's state.
+    """Find the simulator states that a Minari dataset records.
 
     Args:
         file: its HDF5 file.
@@ -141,7 +141,7 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
         group = opened[episodes[0]]
         infos = entries(group["infos"], "infos") if "infos" in group else {}
         recorded = [path for path in infos if path.rpartition("/")[2] == "qpos"]
-        there = {*infos, *entries(group["observations"], "observations")}
+        paths = {*infos, *entries(group["observations"], "observations")}
     if plugin is not None:
         columns: Columns = ()
     elif len(recorded) > 1:
@@ -151,7 +151,7 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
     stage = stage_of(env_spec, tuple(cameras))
     folder = columns[0][0].rpartition("/")[0] if columns else "infos/state"
     scenery = tuple(path.format(folder=folder) for path in stage.scenery)
-    missing = [path for path in (*scenery, *(path for path, *_ in columns)) if path not in there]
+    missing = [path for path in (*scenery, *(path for path, *_ in columns)) if path not in paths]
     if missing:
         raise BadInput(
             f"{what} lacks {', '.join(missing)}, without which frames of {spec.get('id')} would be wrong. Record it, "
@@ -168,7 +168,7 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
 
 
 def _observed_qpos(row: RecordedEnv, spec: Mapping[str, Any], what: str) -> Columns:
-    """Return where the observations of an environment hold the qpos that is not recorded."""
+    """Return the columns of the observations that hold qpos, where the infos do not."""
     columns = row.observed_qpos(spec.get("kwargs") or {})
     if columns is None:
         raise BadInput(

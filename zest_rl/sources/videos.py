@@ -32,19 +32,16 @@ class EpisodeVideos:
         return [paths[0].parent.name for paths in self.paths]
 
     def describe(self) -> dict[str, Any]:
-        """Tell which folders the frames are from, and how they align."""
-        return {
-            "kind": "clips",
-            "views": list(self.views),
-            "alignment": "frame t is x_t; of T, x_T repeats the last",
-        }
+        """The folders, and the alignment of frames and steps."""
+        alignment = "frame t is x_t; of T, x_T repeats the last"
+        return {"kind": "clips", "views": list(self.views), "alignment": alignment}
 
     def digest(self, episode: int) -> str:
         """Hash the files."""
         return artifacts.hash_json([[artifacts.hash_file(file) for file in _files(of[episode])] for of in self.paths])
 
     def read(self, episode: int) -> Iterator[Sequence[Frame]]:
-        """Decode the views side by side."""
+        """Decode all views in step."""
         paths = [of[episode] for of in self.paths]
         try:
             yield from zip(*map(iter_frames, paths), strict=True)
@@ -67,7 +64,7 @@ def find_videos(folders: Sequence[Path], n_episodes: int, what: str) -> EpisodeV
         what: names the dataset in an error.
 
     Raises:
-        BadInput: a video is missing, is there twice, or is of no episode.
+        BadInput: the video of an episode is missing or there are two, or there are more videos than episodes.
     """
     paths = []
     for folder in folders:
