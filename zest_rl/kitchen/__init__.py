@@ -1,1 +1,1 @@
-"""One robot, six tasks: the environment, its experts, how they are recorded, and how the scene is drawn."""
+"""One robot, six tasks: the environment, its experts, their recordings, and the rendered scene."""

@@ -1,4 +1,4 @@
-"""The robot's arm as a tool: brings a point of the gripper to a place, within what the joints can do in one step."""
+"""Control of the robot's arm: moves a point of the gripper to a target, within the joints' limits per step."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OPEN, CLOSED = 1.0, -1.0  # finger commands
 
 
 class Arm:
-    """Moves the gripper by damped least squares on the arm's Jacobian, within what the joints can do in one step."""
+    """Moves the gripper by damped least squares on the arm's Jacobian, within the joints' limits per step."""
 
     POSITION_GAIN, ROTATION_GAIN = 0.8, 0.3  # share of the error to remove in one step
     MAX_TRAVEL, MAX_TURN = 0.08, 0.2  # m, rad per step
@@ -28,7 +28,7 @@ class Arm:
     MIN_STEP = 1e-4  # rad; keeps the bounds of a joint at its limit apart
 
     def __init__(self, env: KitchenEnv, tip_offset: float) -> None:
-        """Steer the point that lies `tip_offset` m from the end-effector site along the gripper."""
+        """Steer the point `tip_offset` m from the end-effector site along the gripper."""
         model = env.model
         self._tip_offset = tip_offset
         self._model, self._data = model, env.data
@@ -59,7 +59,7 @@ class Arm:
         return self._action(self._gravity(), fingers)
 
     def move(self, target: Vector, rotation: Matrix, fingers: float, max_travel: float = MAX_TRAVEL) -> FloatArray:
-        """Return the action that brings the steered point and the gripper's rotation nearer to their targets."""
+        """Return the action that moves the steered point and the gripper's rotation towards their targets."""
         tip, current = self.pose()
         travel = _limit_norm(self.POSITION_GAIN * (target - tip), max_travel)
         turn = _limit_norm(self.ROTATION_GAIN * (current @ _rotation_vector(current.T @ rotation)), self.MAX_TURN)
@@ -96,12 +96,12 @@ def bounded_least_squares(
     """Return the step x (n,) that minimises ``|J x − task|² + damping² |x − preferred|²`` inside the bounds.
 
     The joint that exceeds its bound by the largest factor is fixed there and the others are solved again, until all are
-    inside. That is not always the exact minimum, but it keeps the direction of the task where clipping would not.
+    inside. That is not always the exact minimum but, unlike clipping, it keeps the direction of the task.
 
     Args:
         jacobian: (m, n).
-        task: (m,) wanted change of what the Jacobian maps to.
-        preferred: (n,) step to take where the task leaves freedom.
+        task: (m,) wanted change in the Jacobian's output space.
+        preferred: (n,) step in the directions that the task leaves free.
         low: (n,) lower bounds, negative.
         high: (n,) upper bounds, positive.
         damping: in the units of `jacobian`, positive.

@@ -1,8 +1,8 @@
 """An imperfect expert of the kitchen, and its episodes.
 
 As in the paper the expert's actions get uniform noise whose level is drawn per trajectory: episode i acts with
-``clip(expert + U(−s_i, s_i))``, ``s_i = u_i · noise_max``, ``u_i ~ U(0, 1)``. The other ways to fall short, each drawn
-per trajectory, too, are fields of `Behaviour`.
+``clip(expert + U(−s_i, s_i))``, ``s_i = u_i · noise_max``, ``u_i ~ U(0, 1)``. The other flaws, also drawn per
+trajectory, are fields of `Behaviour`.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from zest_rl.types import FloatArray
 
 EPISODES_PER_JOB = 5
 STOP_BETWEEN = (0.1, 1.0)
-_CODE = ("behaviour.py", "env.py", "arm.py", "experts.py", "tasks.py")  # decides an episode, beside the behaviour
+_CODE = ("behaviour.py", "env.py", "arm.py", "experts.py", "tasks.py")  # with the behaviour, determines an episode
 
 
 @dataclass(frozen=True)
 class Behaviour:
-    """Who acts, and how its episodes are numbered: episode i of a behaviour is always the same episode."""
+    """A policy with its flaws and seed: episode i of a behaviour is always the same episode."""
 
     task: str
     policy: str
@@ -44,11 +44,11 @@ class Behaviour:
     stop_share: float = 0.0
     """Share of the episodes in which the expert stops early, at a progress drawn from U(`STOP_BETWEEN`)."""
     slow_max: float = 0.0
-    """The expert makes a share 1 − U(0, slow_max) of its movement at each step."""
+    """At each step the expert makes the share 1 − U(0, slow_max) of its movement."""
     bias_max: float = 0.0
-    """Largest constant error of an action: each component is off by U(−b, b) all episode, b ~ U(0, bias_max)."""
+    """Largest constant error of an action: U(−b, b) in each component for a whole episode, b ~ U(0, bias_max)."""
     grip_max: float = 0.0
-    """Largest error of the grip, in m: it is off by U(−g, g) along each axis, g ~ U(0, grip_max)."""
+    """Largest error of the grip, in m: U(−g, g) along each axis, g ~ U(0, grip_max)."""
     init_noise: float = 0.05
     """Half-width of the uniform noise on the arm's start, in rad."""
     seed: int = 0
@@ -62,7 +62,7 @@ class Behaviour:
             raise BadInput(f"seed must be 0 or positive, got {self.seed}")
 
     def without_flaws(self) -> Behaviour:
-        """Return the same starts, acted on as well as can be."""
+        """Return this behaviour, with the same starts, without flaws."""
         values: dict[str, Any] = dict.fromkeys(LARGEST, 0.0)
         return replace(self, **values)
 
@@ -106,10 +106,10 @@ def rollout(behaviour: Behaviour, index: int) -> Arrays:
 
 
 def draw_manner(behaviour: Behaviour, rng: np.random.Generator) -> tuple[Manner, FloatArray]:
-    """Draw how the expert acts in one episode, and the constant error (9,) float32 of its actions.
+    """Draw the expert's manner in one episode, and the constant error (9,) float32 of its actions.
 
-    Every number is drawn whether it is used or not, so that an episode's draws do not depend on which ways to fall
-    short are switched on, nor on how far: what is calibrated moves each episode along a line.
+    Every number is drawn whether it is used or not, so that an episode's draws depend neither on which flaws are on nor
+    on their size: calibration changes each episode continuously.
     """
     stops, stop_at, slow, grip, bias = rng.uniform(size=5)
     directions = rng.uniform(-1.0, 1.0, 3 + ACT_DIM)
@@ -166,7 +166,7 @@ def returns(episodes: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
 
 
 def recordings(episodes: Mapping[str, NDArray[Any]]) -> list[Recording]:
-    """Turn stacked episodes into what `zest_rl.data.writer.write_dataset` takes."""
+    """Turn stacked episodes into recordings for `zest_rl.data.writer.write_dataset`."""
     return [
         Recording(
             seed=int(episodes["seed"][i]),

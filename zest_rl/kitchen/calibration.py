@@ -1,7 +1,7 @@
-"""How good an imperfect expert is, in percent of the perfect one, and how imperfect it must be for a wanted level.
+"""The level of an imperfect expert in percent of the perfect one, and calibration of a flaw to a given level.
 
-Calibration moves one field of a `Behaviour` and looks at the returns of the dataset's very episodes, never at a trained
-policy.
+Calibration changes one field of a `Behaviour` and measures the returns of the dataset's own episodes, never those of a
+trained policy.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from zest_rl.kitchen.collect_config import LARGEST
 from zest_rl.metrics import statistics
 
 REFERENCE_STREAM = 2**31
-"""Episodes from this index on serve the reference returns; datasets stay below it."""
+"""First index of the episodes for reference returns; datasets stay below it."""
 TOLERANCE = 0.5
-"""Percent of the expert within which a calibrated dataset meets its level."""
+"""Largest deviation of a calibrated dataset from its level, in percent of the expert."""
 N_REFERENCE = 100
-"""Episodes that measure the expert."""
+"""Episodes of the expert for its reference return."""
 N_NOTHING = 10
-"""Episodes of the robot doing nothing: their returns hardly differ."""
+"""Episodes of the robot doing nothing, whose returns hardly differ."""
 
 
 @dataclass(frozen=True)
@@ -80,22 +80,22 @@ def calibrate(
 ) -> Behaviour:
     """Find the value of one field of a behaviour at which its episodes' mean normalized return meets `target`.
 
-    The level falls as the value rises. Tried are the value where a straight line between the two nearest levels known
-    meets the target (kept off both ends), and twice the value while none was low enough.
+    The level falls as the value rises. The value doubles until the level is below the target; then it is interpolated
+    linearly between the nearest levels on both sides, kept off the ends.
 
     Args:
-        behaviour: what acts; its field `flaw` is ignored.
+        behaviour: its field `flaw` is ignored.
         flaw: a key of `LARGEST`.
-        n_episodes: the dataset's size; the very episodes of the dataset are used.
+        n_episodes: the dataset's size; the episodes are those of the dataset.
         references: the two ends of the scale.
         target: percent of the expert, e.g. 81.19.
         tolerance: stop within this many percent.
-        n_rounds: at most so many tries.
+        n_rounds: largest number of values to try.
         n_workers: processes, default one per core.
         on_round: called with (value, percent) after each.
 
     Raises:
-        BadInput: `target` is not in (0, 100], or `flaw` is not one that can be calibrated.
+        BadInput: `target` is not in (0, 100], or `flaw` cannot be calibrated.
         ZestError: no value within `tolerance` was found.
     """
     if not 0 < target <= 100:

@@ -26,15 +26,15 @@ from zest_rl.runtime.arrays import Arrays
 
 @dataclass(frozen=True)
 class Collected:
-    """A dataset that was collected."""
+    """Result of `collect_dataset`."""
 
     dataset_id: str
     path: Path
     """Its folder."""
     result: Mapping[str, Any]
-    """Flaws with their values, returns of the references, normalized return; JSON-ready, as the dataset keeps it."""
+    """Flaws with their values, returns of the references, normalized return; JSON-ready, as in the dataset's record."""
     already_there: bool
-    """It was collected before, and nothing was done."""
+    """Whether the dataset existed."""
 
 
 def collect_dataset(
@@ -47,7 +47,7 @@ def collect_dataset(
     """Measure the references, calibrate if asked to, roll out, write; finished episodes are kept after an interruption.
 
     Args:
-        config: what is collected.
+        config: of the dataset.
         n_workers: processes, default one per core.
         on_progress: called with (episodes done, episodes in all), of the references and of the dataset.
         on_result: called with a sentence about each result on the way: references, and each try of a calibration.
@@ -115,7 +115,7 @@ def _result(episodes: Arrays, flaws: Mapping[str, float], references: References
 
 
 def _collected_before(config: CollectConfig, asked: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
-    """Return the result of the dataset that is there, if it is what is asked for."""
+    """Return the result of the dataset on disk, if it was collected with equal arguments."""
     with reader.open_dataset(config.dataset_id) as ds:
         record = ds.record.collect
     if record is None or not _is_same(asked, record):
@@ -128,7 +128,7 @@ def _collected_before(config: CollectConfig, asked: Mapping[str, Any], path: Pat
 
 
 def _is_same(asked: Mapping[str, Any], record: CollectRecord) -> bool:
-    """Whether a dataset is what is asked for; a number that calibration found is as good as the same number given."""
+    """Whether a dataset fits the arguments; a calibrated value counts as equal to the same value given."""
     values = {name: record.result[name] for name in LARGEST}
     calibrated = any(asked[name] == "calibrate" for name in LARGEST)
     off_by = abs(record.result["normalized_return"]["value"] - asked["level"])

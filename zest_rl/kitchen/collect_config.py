@@ -1,4 +1,4 @@
-"""What is collected: the arguments of `zest_rl.kitchen.collect.collect_dataset`. Importing this loads no simulator."""
+"""The arguments of `zest_rl.kitchen.collect.collect_dataset`. Importing this module loads no simulator."""
 
 from __future__ import annotations
 
@@ -10,15 +10,11 @@ from zest_rl.errors import BadInput
 from zest_rl.kitchen.tasks import get_task
 
 LARGEST = {"noise_max": 2.0, "stop_share": 1.0, "slow_max": 0.9, "bias_max": 1.0, "grip_max": 0.1}
-"""Bounds of what makes an expert imperfect, and what can be calibrated."""
+"""Largest values of the expert's flaws, any of which can be calibrated."""
 
 
 def check_flaws(flaws: Mapping[str, float]) -> None:
-    """Refuse values out of the bounds of `LARGEST`.
-
-    Raises:
-        BadInput: one is.
-    """
+    """Check that values are in [0, `LARGEST`]; raises `BadInput`."""
     for name, value in flaws.items():
         if not 0 <= value <= LARGEST[name]:
             raise BadInput(f"{name} must be in [0, {LARGEST[name]}], got {value}")
@@ -69,7 +65,7 @@ class CollectConfig:
 
     @property
     def given_flaws(self) -> dict[str, float]:
-        """What makes the expert imperfect, but for what is calibrated."""
+        """The flaws that have a value, without the one that is calibrated."""
         flaws = {name: getattr(self, name) for name in LARGEST}
         return {name: value for name, value in flaws.items() if value != "calibrate"}
 

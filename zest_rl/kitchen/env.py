@@ -1,17 +1,17 @@
 """The MuJoCo kitchen as a Gymnasium environment: one task, flat observation, ground truth kept apart in ``info``.
 
 Model, start state and control are those of gymnasium-robotics' ``FrankaKitchen-v1``; only this module imports that
-package. What differs, and why:
+package. Differences, and why:
 
 - no observation noise. There, control starts from the last *noisy* joint positions, so the same state and action
   can lead to different states; here the next state depends on state and action alone;
 - the seed moves the arm's start (there it drives the noise only), and start values beyond a joint's range are clipped;
-- objects start at rest. There the kettle starts tilted and in the air: it falls by a millimetre within the first step,
-  a change that every later frame would show and that is not the robot's doing;
+- objects start at rest. There the kettle starts tilted and in the air and falls by a millimetre in the first step, a
+  change in every later frame that the robot did not cause;
 - the reward is the progress of one joint, so that it is a level like the ZeST scores; nothing ends an episode early.
 
-Importing this module registers ``zest/Kitchen-v1``; its number rises with every change of what an action does or where
-an episode starts, so that neither data nor policies of an earlier one are taken for its own.
+Importing this module registers ``zest/Kitchen-v1``; the version rises with every change of the dynamics or the starts,
+so that data and policies of an earlier version are not mistaken for those of this one.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ ACT_DIM = 9
 """Seven arm joints, then two fingers."""
 ARM_DIM = 7
 SETTLE_STEPS = 1000
-"""Simulator steps (2 s) in which the objects come to rest before anything starts."""
+"""Simulator steps (2 s) in which the objects come to rest before an episode."""
 FRAME_SKIP = 40
 """Simulator steps of 2 ms per environment step: 12.5 Hz."""
 MAX_JOINT_SPEED = 2.0
@@ -159,7 +159,7 @@ def _address(joint: str) -> int:
 
 @dataclass(frozen=True)
 class _Kitchen:
-    """What all instances share; nothing writes to it."""
+    """Shared by all instances, and read-only."""
 
     model: mujoco.MjModel
     start_qpos: NDArray[np.float64]  # (nq,)
@@ -169,7 +169,7 @@ class _Kitchen:
 
 @cache
 def _load_kitchen() -> _Kitchen:
-    """Take model and constants from FrankaKitchen-v1 itself: compiling the model costs 0.2 s, the rest nothing."""
+    """Take model and constants from FrankaKitchen-v1; compiling the model costs 0.2 s."""
     check_mujoco(mujoco.__version__)
     robot = FrankaKitchen().robot_env
     low, high = robot.robot_pos_bound[:ACT_DIM].T.copy()
@@ -180,7 +180,7 @@ def _load_kitchen() -> _Kitchen:
 
 
 def _at_rest(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a copy of `qpos` (nq,) with the objects where they come to rest; the robot stays where it is."""
+    """Return a copy of `qpos` (nq,) with the objects at rest and the robot unmoved."""
     data = mujoco.MjData(model)
     data.qpos[:] = _clip_to_ranges(model, qpos)
     data.ctrl[:] = qpos[:ACT_DIM]
@@ -191,10 +191,10 @@ def _at_rest(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def check_mujoco(version: str) -> None:
-    """Refuse the versions of mujoco that FrankaKitchen-v1 fails with.
+    """Refuse versions of mujoco with which FrankaKitchen-v1 fails.
 
     Raises:
-        ZestError: `version` is out of range; the message says what to install.
+        ZestError: `version` is out of range; the message gives the command to install another.
     """
     if not _MUJOCO_FROM <= tuple(int(part) for part in version.split(".")[:3]) < _MUJOCO_BELOW:
         wanted = f"mujoco>={'.'.join(map(str, _MUJOCO_FROM))},<{'.'.join(map(str, _MUJOCO_BELOW))}"

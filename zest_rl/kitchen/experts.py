@@ -1,8 +1,8 @@
 """Scripted experts that solve the kitchen's tasks from the simulator's state, and the noise that makes them imperfect.
 
 An expert computes its action from the current state alone (no memory, no plan, no randomness), so it recovers from
-noise put on its actions and may be asked at any state. There are two skills, dragging a bar and pushing a part; the
-left door needs both. What a task needs is a row in `SKILLS`.
+noise on its actions and can act from any state. There are two skills, dragging a bar and pushing a part; the left door
+needs both. Each task is a row in `SKILLS`.
 """
 
 from __future__ import annotations
@@ -17,15 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.errors import BadInput, nearest
-from zest_rl.kitchen.arm import (
-    CLOSED,
-    OPEN,
-    Arm,
-    Vector,
-    angle_between,
-    gripper_rotation,
-    rotate_about,
-)
+from zest_rl.kitchen.arm import CLOSED, OPEN, Arm, Vector, angle_between, gripper_rotation, rotate_about
 from zest_rl.kitchen.env import ARM_DIM, KitchenEnv
 from zest_rl.types import FloatArray
 
@@ -38,7 +30,6 @@ class Expert(Protocol):
 
     def act(self) -> FloatArray:
         """Return the action (9,) float32 in [-1, 1] for the environment's current state, which is not changed."""
-        ...
 
 
 # Lengths in m, angles in rad. Yaw is an approach direction: 0 points along world +y, positive turns towards -x; pitch
@@ -62,7 +53,7 @@ class BarDrag:
     """How far ahead on the hinge's arc the gripper is drawn while dragging."""
     held_width: float = 0.054
     held_distance: float = 0.04
-    """The bar is held: fingers at most `held_width` apart and the tip at most so far from the bar."""
+    """The bar is held if the fingers are at most `held_width` apart and the tip at most this far from the bar."""
     tip_offset: float = 0.012
 
 
@@ -78,7 +69,7 @@ class Push:
     lead: float
     """How far ahead along the joint the tip is drawn while pushing, in m or rad."""
     clearance: float
-    """How far behind the contact the tip comes near."""
+    """Distance behind the contact at which the tip approaches."""
     tolerance: float
     """Push while the tip is no further than this from the line of pushing."""
     tip_offset: float
@@ -86,13 +77,13 @@ class Push:
 
 @dataclass(frozen=True)
 class DragThenPush:
-    """Drag a hinged door ajar by its bar, let go, reach round its free edge and push it open from inside."""
+    """Drag a hinged door ajar by its bar, release it, reach round its free edge and push it open from inside."""
 
     drag: BarDrag
     ajar: float
-    """Angle from which on the door is pushed, and dragged no more."""
+    """Angle beyond which the door is pushed instead of dragged."""
     barely_ajar: float
-    """Angle from which on it is pushed if the hand is behind it already."""
+    """Angle beyond which it is pushed if the hand is already behind it."""
     height: float
     """World height of the hand while pushing: below the bars."""
     width: float
@@ -131,14 +122,14 @@ SKILLS: dict[str, BarDrag | Push | DragThenPush] = {
 
 @dataclass(frozen=True)
 class Manner:
-    """How an expert acts; the defaults are its best."""
+    """How an expert acts; by default without flaws."""
 
     stop_at: float = DONE_PROGRESS
-    """Progress from which on it holds still."""
+    """Progress beyond which it holds still."""
     speed: float = 1.0
-    """Share of the movement that it makes at each step, in (0, 1]."""
+    """Share of its movement that it makes at each step, in (0, 1]."""
     grip_error: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """By how much it mistakes the place of the bar or the contact, in m along the world's axes."""
+    """Error of the position of the bar or the contact, in m along the world's axes."""
 
     def __post_init__(self) -> None:
         if not 0 < self.speed <= 1:
@@ -152,11 +143,11 @@ def make_expert(task_name: str, env: gymnasium.Env[Any, Any], manner: Manner | N
 
     Args:
         task_name: a name in ``zest_rl.kitchen.tasks.TASKS``.
-        env: what the actions are computed for.
-        manner: how it acts, default as well as it can.
+        env: the environment to act on.
+        manner: default without flaws.
 
     Raises:
-        BadInput: there is no such task (the message names the nearest), or `env` is not of it.
+        BadInput: there is no such task (the message names the nearest), or `env` is of another one.
     """
     if task_name not in SKILLS:
         raise BadInput(f"there is no expert for task {task_name!r}; {nearest(task_name, SKILLS)}")
@@ -180,7 +171,7 @@ def add_uniform_noise(action: FloatArray, level: float, rng: np.random.Generator
 
 
 class _ScriptedExpert:
-    """Acts by the task's skill until the task is done (or what its manner calls so), then holds still."""
+    """Acts by the task's skill up to the progress in its manner, then holds still."""
 
     def __init__(self, env: KitchenEnv, skill: BarDrag | Push | DragThenPush, manner: Manner) -> None:
         self._env, self._manner, self._arm = env, manner, Arm(env, 0.0)
@@ -199,7 +190,7 @@ class _ScriptedExpert:
 
 
 class _Joint:
-    """The task's joint: where it is, and where a point of the moving part gets when it moves on."""
+    """The task's joint: its position, and where points of the moving part are when it moves on."""
 
     def __init__(self, env: KitchenEnv) -> None:
         self._env = env
@@ -232,10 +223,10 @@ class _Joint:
 
 
 class _BarDragger:
-    """Approach the bar from the front, close on it, drag it; which of the three is read from the state."""
+    """Approach the bar from the front, close on it, drag it; the state decides which of the three."""
 
     # "beside" is the tip's distance from the line of approach, "ahead" along it.
-    BESIDE_FREE = 0.012  # back off beyond this, not to hit the bar sideways
+    BESIDE_FREE = 0.012  # back off beyond this, so as not to hit the bar sideways
     BACK_OFF_PER_BESIDE, BACK_OFF_PER_ANGLE, MAX_BACK_OFF = 4.0, 0.3, 0.13
     MISALIGNED = 0.15  # back off beyond this angle to the line of approach
     OPEN_WIDTH = 0.05  # between the fingers; below it they are closing
@@ -270,7 +261,7 @@ class _BarDragger:
 
 
 class _Pusher:
-    """Come near behind the contact, then push along the joint; which of the two is read from the state."""
+    """Approach behind the contact, then push along the joint; the state decides which of the two."""
 
     ALONG = (-0.08, 0.03)  # how far behind and past the contact the tip may be while pushing
     BESIDE_FREE, BACK_OFF_PER_BESIDE, MAX_BACK_OFF = 0.01, 3.0, 0.08  # as for dragging
@@ -298,16 +289,13 @@ class _Pusher:
 
 
 class _DoorOpener:
-    """Drag the door ajar, then push it from inside; which step it is at is read from the state.
+    """Drag the door ajar, then push it from inside; the state decides the step.
 
     Places are given in the door's own plane: `s` from the hinge along the door, `n` from the door to its inside.
     """
 
-    INSIDE, OUTER = (
-        0.018,
-        0.08,
-    )  # n from which on the tip is behind the door; s past the free edge that is still near it
-    PUSH_N, ENTER_N = 0.035, 0.045  # n of the tip while pushing and while coming to the place where it pushes
+    INSIDE, OUTER = 0.018, 0.08  # n beyond which the tip is behind the door; s past the free edge that is still near
+    PUSH_N, ENTER_N = 0.035, 0.045  # n of the tip while pushing and while moving to where it pushes
     PAST_EDGE = 0.015  # s beyond the free edge up to which the tip may push
     ROUND_EDGE, ROUND_RANGE, ROUND_N = 0.045, 0.03, (-0.12, -0.03, 0.06)  # the way round the free edge
     AT_BAR, BELOW_BAR = 0.04, 0.18  # the tip is at the bar: horizontal distance, and depth below it

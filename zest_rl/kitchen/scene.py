@@ -1,8 +1,8 @@
-"""The kitchen as it is drawn: a render-only model, and cameras around the part that a task moves.
+"""Rendering the kitchen: a render-only model, and cameras around the part that a task moves.
 
-The model never steps, so everything that costs time but shows nothing is left out of it (shadows, reflections,
+The model is never stepped, so it leaves out everything that costs time but shows nothing (shadows, reflections,
 multisampling, the sky, most faces of the robot's meshes, and the whole robot when it is hidden). The physics model
-stays untouched; only the joint positions ``qpos`` are taken over.
+stays untouched; only its joint positions ``qpos`` are copied.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _DISTANCES = (1.0, 0.7, 1.4)  # metres
 
 @dataclass(frozen=True)
 class RenderConfig:
-    """What frames look like, apart from the cameras."""
+    """Everything that a frame depends on besides state and cameras."""
 
     size: int = 224
     """Height and width of a frame, in pixels."""
@@ -57,7 +57,7 @@ class RenderConfig:
             raise BadInput(f"mesh_fraction must be in (0, 1], got {self.mesh_fraction}; 1 keeps every face")
 
     def fingerprint(self) -> str:
-        """Return a sha256 over all that decides a frame except state and cameras: config, code, MuJoCo, assets.
+        """Hash everything that a frame depends on except state and cameras: config, code, MuJoCo, assets.
 
         Raises:
             ZestError: gymnasium-robotics is not installed.
@@ -99,16 +99,14 @@ def open_renderer(config: RenderConfig, cameras: tuple[Camera, ...]) -> StateRen
 
 @functools.cache
 def shared_renderer(config: RenderConfig, cameras: tuple[Camera, ...]) -> StateRenderer:
-    """Return this process's renderer, open until the process ends: to build one takes half a second, or with the
-    robot's meshes two.
-    """
+    """Return this process's renderer, open until the process ends; building one takes 0.5 s, or 2 s with the robot."""
     renderer = open_renderer(config, cameras)
-    atexit.register(renderer.close)  # left open, or closed after the GL library, it complains when the process ends
+    atexit.register(renderer.close)  # left open, or closed after the GL library, it prints errors at exit
     return renderer
 
 
 def gl_backend() -> str:
-    """Return the name of the GL backend that works, seen by rendering one frame.
+    """Return the name of the GL backend after rendering one frame with it.
 
     Raises:
         ZestError: none works.
@@ -130,7 +128,7 @@ def _kitchen_folder() -> Path:
 
 
 def _render_model(config: RenderConfig) -> mujoco.MjModel:
-    """Compile the kitchen with what cannot be seen left out."""
+    """Compile the kitchen without anything that cannot be seen."""
     folder = _kitchen_folder()
     spec = mujoco.MjSpec.from_file(str(folder / "kitchen_assets" / "kitchen_env_model.xml"))
     if config.robot:

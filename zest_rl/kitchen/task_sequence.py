@@ -19,24 +19,24 @@ from zest_rl.kitchen.tasks import get_task
 
 @dataclass(frozen=True)
 class Performance:
-    """Several tasks, done one after another."""
+    """One episode of several tasks."""
 
     states: NDArray[np.float64]
     """(T+1, nq) simulator positions."""
     done_at: dict[str, int]
-    """Task → step at which the ground truth has it reached."""
+    """Task → step at which it succeeds by ground truth."""
 
 
 def perform(tasks: Sequence[str], seed: int) -> Performance:
-    """Let the experts do `tasks` in this order; each starts where the one before it succeeded.
+    """Let the experts do `tasks` in this order; each starts where the previous one succeeded.
 
     Args:
         tasks: names in ``zest_rl.kitchen.tasks.TASKS``, at least 2, all different.
         seed: of the arm's start.
 
     Raises:
-        BadInput: too few tasks, one twice, or one that does not exist.
-        ZestError: an expert did not succeed within `HORIZON` steps from where it had to start.
+        BadInput: too few tasks, a repeated task, or an unknown one.
+        ZestError: an expert did not succeed within `HORIZON` steps.
     """
     if len(tasks) < 2 or len(set(tasks)) < len(tasks):
         raise BadInput(f"an episode of several steps needs 2 or more different tasks, got {', '.join(tasks) or 'none'}")

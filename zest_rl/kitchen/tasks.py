@@ -1,7 +1,7 @@
-"""The six kitchen tasks of the paper as rows of a table: everything that differs between tasks, and no code.
+"""The six kitchen tasks of the paper as a table: everything that differs between tasks, and no code.
 
 Joint limits and goals are FrankaKitchen-v1's; two goals differ from that environment's own tasks (`knob2`, `knob3`
-name burners that it calls otherwise), so progress is always read from the joint itself.
+are burners that it names differently), so progress is always read from the joint itself.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from zest_rl.errors import BadInput, nearest
 
 @dataclass(frozen=True)
 class Task:
-    """One manipulation: which joint, how far, where to look, what to call it."""
+    """One manipulation: its joint and goal, cameras, and names."""
 
     name: str
     joint: str
@@ -27,7 +27,7 @@ class Task:
     goal_folder: str
     """Folder of this task in the Visual Tasks Dataset."""
     action: str
-    """What is done, whatever it is done to: tasks with the same action are equal to action selection."""
+    """The verb, whatever the object: for action selection, tasks with the same action are equal."""
     start_text: str
     goal_text: str
 

@@ -1,4 +1,4 @@
-"""Recorded kitchen states → MP4 videos with the robot in view, for people to look at; no score uses them."""
+"""Recorded kitchen states → MP4 videos with the robot in view, for people; no score uses them."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ FPS = 12.5
 
 @dataclass(frozen=True, eq=False)
 class Video:
-    """An episode to be shown, and where."""
+    """An episode and the file of its video."""
 
     states: NDArray[np.float64]
     """(T+1, nq) simulator positions."""
     path: Path
     beside: NDArray[np.float64] | None = None
-    """(T+1, nq) of another episode, which is shown to the right."""
+    """(T+1, nq) of another episode, shown on the right."""
 
 
 Film = Callable[[Video], Path]
-"""Returns the path of a video that is there, or will be when somebody looks at it."""
+"""Returns the path of a video, which may be written later."""
 
 
 def write_video(video: Video, size: int = 320) -> Path:
@@ -45,12 +45,12 @@ def write_video(video: Video, size: int = 320) -> Path:
 
 
 def ensure_video(video: Video) -> Path:
-    """Return the video's path, after `write_video` if nothing is there yet."""
+    """Write the video if it does not exist, and return its path."""
     return video.path if video.path.exists() else write_video(video)
 
 
 def missing(videos: Iterable[Video]) -> dict[Path, Video]:
-    """Return by their paths those videos that are not there."""
+    """Return the videos that do not exist, by their paths."""
     return {video.path: video for video in videos if not video.path.exists()}
 
 
@@ -60,9 +60,9 @@ def ensure_videos(
     """Write the `missing` videos, one process per core.
 
     Args:
-        videos: what to write.
+        videos: existing ones are skipped.
         n_workers: number of processes, default one per core.
-        on_done: called for each of them.
+        on_done: called after each.
 
     Raises:
         ZestError: a process died; finished videos are kept.

@@ -1,6 +1,6 @@
-"""Kitchen states → frames: rendered from a ring of views around what the task moves; equal states are one frame.
+"""Kitchen states → frames, rendered from a ring of views around the part that the task moves.
 
-With the robot hidden a frame depends on the objects' joints alone.
+With the robot hidden a frame depends on the objects' joints alone, so many states share a frame.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from zest_rl.simulation.views import each_once, on_grid
 
 @dataclass(frozen=True)
 class Views:
-    """What is rendered of a state: which task is looked at, from how many sides, how finely states are told apart."""
+    """How a state is rendered: views around the object of a task, and the grid on which states are rounded."""
 
     task: str
     n_views: int = 8
@@ -29,7 +29,7 @@ class Views:
     robot: bool = False
     """Show the robot (the paper removes it from view)."""
     tolerance: float = 1e-3
-    """Grid on which joint positions are rounded, in rad or m; 0 tells all different states apart."""
+    """Grid on which joint positions are rounded, in rad or m; 0: no rounding."""
 
     def __post_init__(self) -> None:
         get_task(self.task)
@@ -61,7 +61,7 @@ class Views:
 
 
 def canonical_states(qpos: NDArray[np.float64], views: Views) -> NDArray[np.float64]:
-    """Round states to the grid and clear what no frame depends on: (N, nq) → (N, nq); equal rows, equal frames."""
+    """Round states to the grid and zero what no frame depends on: (N, nq) → (N, nq); equal rows have equal frames."""
     return on_grid(qpos, relevant_qpos(views.render_config), views.tolerance)
 
 

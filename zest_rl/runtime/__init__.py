@@ -1,1 +1,1 @@
-"""What is cut goes on, and what is on disk is whole: artifacts, parallel work, GL, the order of imports."""
+"""Atomic artifacts, parallel work that resumes after an interruption, GL contexts, and the order of imports."""

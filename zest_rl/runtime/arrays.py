@@ -1,4 +1,4 @@
-"""Named arrays in ``.npz`` files: written atomically, and never read in part."""
+"""Named arrays in ``.npz`` files: written atomically, read whole or not at all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from zest_rl.runtime import artifacts
 
 Arrays = Mapping[str, NDArray[Any]]
 _DAMAGED = (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile)
-"""What reading a damaged ``.npz`` file may raise; RuntimeError: damaged zip flags."""
+"""Errors that reading a damaged ``.npz`` file may raise; RuntimeError: damaged zip flags."""
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]] | None:

@@ -1,7 +1,7 @@
-"""How stages leave things on disk: atomic writes, content hashes, locks, provenance.
+"""Artifacts on disk: atomic writes, content hashes, locks, provenance.
 
 A file or folder under its final name is complete. Everything is built under a temporary name in the same folder and
-renamed once, so a cut at any point leaves either the old artifact or the new one.
+renamed once, so an interruption at any point leaves either the old artifact or the new one.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ PACKAGES = (
 
 
 def cache_dir() -> Path:
-    """Folder of everything that can be recomputed: ``$ZEST_CACHE``, else ``~/.cache/zest_rl``. Not created here."""
+    """Return the folder of recomputable files: ``$ZEST_CACHE``, else ``~/.cache/zest_rl``. Not created here."""
     return Path(os.environ.get("ZEST_CACHE") or Path.home() / ".cache" / "zest_rl")
 
 
@@ -53,7 +53,7 @@ def hash_arrays(*arrays: NDArray[Any]) -> str:
 
 
 def hash_stream(arrays: Iterable[NDArray[Any]]) -> str:
-    """Return the `hash_arrays` of arrays that are not all in memory at once."""
+    """Return the `hash_arrays` of arrays of which one at a time is in memory."""
     digest = hashlib.sha256()
     for array in arrays:
         digest.update(f"{array.dtype.str}{array.shape}".encode())
@@ -129,10 +129,10 @@ def read_json(path: Path) -> Any:
 def staged_folder(final: Path) -> Iterator[Path]:
     """Yield an empty staging folder beside `final`; on success it is renamed to `final`, on failure removed.
 
-    What an earlier, killed process left in the staging place is removed first; hold `lock` around this.
+    Leftovers of a killed process are removed first; hold `lock` around this.
 
     Raises:
-        ZestError: the place cannot be written to (read-only, full, or a folder called `final` is there already).
+        ZestError: the folder cannot be written to (read-only, full), or `final` exists.
     """
     staging = final.parent / f".{final.name}.staging"
     try:
@@ -212,7 +212,7 @@ def versions() -> dict[str, str]:
 
 
 def provenance() -> dict[str, Any]:
-    """Return what made an artifact: command, versions, git revision, machine. JSON-ready, without host paths.
+    """Return command, versions, git revision and machine, JSON-ready, without host paths.
 
     The folders of absolute paths in the command are left out: ``--goal=/home/me/goals`` becomes ``--goal=…/goals``.
     """

@@ -1,4 +1,4 @@
-"""Which GL library draws, and a context of it: EGL, or OSMesa in software, or what the user says by ``MUJOCO_GL``."""
+"""Choice of the GL backend (``MUJOCO_GL``, else EGL, else OSMesa in software), and a GL context of it."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ INSTALL_GL = "apt-get install libegl1 libgl1 libosmesa6"
 def select_gl_backend() -> str:
     """Return the GL backend for this process: the user's ``MUJOCO_GL``, else EGL, else OSMesa.
 
-    A choice is kept in ``MUJOCO_GL``, so that child processes and other renderers agree. It is tried out in a process
-    of its own, because PyOpenGL cannot change its backend after a failed attempt.
+    The choice is kept in ``MUJOCO_GL``, so that child processes and other renderers agree. It is tested in a child
+    process, because PyOpenGL cannot change its backend after a failed attempt.
 
     Raises:
         ZestError: neither EGL nor OSMesa works.

@@ -1,6 +1,6 @@
-"""Jobs side by side: one process per core, and one file per finished job, so that a cut run goes on where it stopped.
+"""Parallel jobs: one process per core, and one file per finished job, so that an interrupted run resumes.
 
-`run_jobs` yields what jobs return; `cached_jobs` leaves it on disk, and does nothing twice.
+`run_jobs` yields the results of jobs; `cached_jobs` writes them to disk and skips finished jobs.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def n_cores() -> int:
 
 
 def die_with_parent() -> None:
-    """End this child process as soon as its parent is gone, be it killed: nobody else would end it."""
+    """End this child process as soon as its parent ends, even if killed: nothing else would end it."""
     parent = multiprocessing.parent_process()
 
     def watch() -> None:
@@ -51,11 +51,11 @@ def die_with_parent() -> None:
 
 @contextmanager
 def starting_children() -> Iterator[None]:
-    """Let processes that are started within the context use one core each, and not run the caller's script again.
+    """Make processes started within the context use one core each, and not run the caller's script again.
 
-    With one core their results do not depend on the number of workers, and none waits for another; set here and not in
-    the child, as the libraries read it when they are loaded. A spawned process would import ``__main__``, which hangs
-    when a script does its work there without ``if __name__ == "__main__"``; what we send it needs no such import.
+    With one core their results do not depend on the number of workers; set here and not in the child, because the
+    libraries read it when they are loaded. A spawned process would import ``__main__``, which hangs if a script does
+    its work there without ``if __name__ == "__main__"``; our jobs do not need that import.
     """
     with _STARTING:
         main = sys.modules["__main__"]
@@ -92,16 +92,16 @@ def run_jobs(
     engine: Engine = "local",
     device: str = "cpu",
 ) -> Iterator[tuple[str, Result]]:
-    """Yield the name and the result of ``work(job)`` for every job, the first that is done first.
+    """Yield the name and the result of ``work(job)`` for every job, in the order in which they finish.
 
-    A single local worker is this process; several are processes of their own, which use one thread each.
+    A single local worker is this process; several are child processes with one thread each.
 
     Args:
-        work: a module-level function, or a partial of one with what all jobs share (it is sent to each worker once).
+        work: a module-level function, or a partial of one with the data that all jobs share (sent once per worker).
         jobs: name → job; jobs and results are picklable.
         n_workers: number of workers, default one per core.
-        engine: where the workers are.
-        device: what the work runs on; Ray gives its workers GPUs by it.
+        engine: local processes or Ray.
+        device: of the work; Ray assigns GPUs by it.
 
     Raises:
         BadInput: `n_workers` is below 1, or there is no such engine.
@@ -137,7 +137,7 @@ def _run_in_pool(
     work: Callable[[Job], Result], jobs: Mapping[str, Job], n_processes: int
 ) -> Iterator[tuple[str, Result]]:
     waiting = iter(jobs.items())
-    running: dict[Future[Result], str] = {}  # never more than processes, as what a pool has taken it does to the end
+    running: dict[Future[Result], str] = {}  # at most one per process: a pool finishes every job submitted to it
     context = multiprocessing.get_context("spawn")  # fork is unsafe beside torch's and the GL library's threads
     with ProcessPoolExecutor(n_processes, context, _start_worker, (work,)) as pool:
         try:
@@ -165,15 +165,15 @@ def cached_jobs(
     engine: Engine = "local",
     device: str = "cpu",
 ) -> Iterator[str]:
-    """Leave the arrays of ``work(job)`` in ``folder/NAME.npz`` for every job, and yield its name when they are there.
+    """Write the arrays of ``work(job)`` to ``folder/NAME.npz`` for every job, and yield its name when they are there.
 
-    What is there already is not done again. Arguments are those of `run_jobs`; a job's name must identify its content,
-    and the work must depend on nothing else. Local workers write what they have done, so that nothing is lost with this
-    process; those of a cluster may have other disks, so this process writes.
+    Finished jobs are skipped. Arguments are those of `run_jobs`; a job's name must identify its content, and the work
+    must depend on nothing else. Local workers write their results, so that nothing is lost with this process; workers
+    of a cluster may have other disks, so this process writes.
 
     Raises:
         BadInput: `n_workers` is below 1, or there is no such engine.
-        ZestError: a worker died (out of memory, killed). What was finished is kept.
+        ZestError: a worker died (out of memory, killed); finished jobs are kept.
     """
     missing = {}
     for name, job in jobs.items():
@@ -189,7 +189,7 @@ def cached_jobs(
 
 
 def _do_named(work: Callable[[Job], Arrays], folder: Path | None, named: tuple[str, Job]) -> Arrays | None:
-    """Do a job; return its arrays, or leave them in the folder if there is one."""
+    """Do a job; write its arrays to the folder, or return them if there is none."""
     name, job = named
     arrays = work(job)
     if folder is None:
@@ -204,7 +204,7 @@ def chunks(n: int, size: int) -> list[range]:
 
 
 def read_parts(folder: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """Join what `cached_jobs` left for these jobs along the first axis.
+    """Read the files of `cached_jobs` for these jobs, joined along the first axis.
 
     Raises:
         ZestError: a part is missing or damaged.

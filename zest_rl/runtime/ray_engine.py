@@ -1,8 +1,8 @@
 """Jobs on a Ray cluster: the other engine of `zest_rl.runtime.parallel`. Needs the extra ``ray``.
 
-Each worker is a Ray actor: a process with a core, and a GPU of its own, for as long as there is work. Ray starts one
-that died anew and repeats its job. Results come back to the process that asked, which alone writes them. Ray Data, made
-for tables, takes twice as long to start and hands back the same arrays.
+Each worker is a Ray actor: a process with one core, and a GPU of its own, for as long as there is work. Ray restarts
+an actor that died and repeats its job. Results return to the calling process, which alone writes them. Ray Data, made
+for tables, takes twice as long to start and returns the same arrays.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from zest_rl.errors import BadInput, ZestError
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 MAX_RETRIES = 3
-"""How often a job is begun again whose worker died."""
-HANDED_ON = ("ZEST_", "MINARI_", "HF_", "TORCH_HOME", "MUJOCO_GL")
-"""Beginnings of the environment variables that workers get."""
+"""How often a job is repeated after its worker died."""
+PASSED_VARIABLES = ("ZEST_", "MINARI_", "HF_", "TORCH_HOME", "MUJOCO_GL")
+"""Prefixes of the environment variables that are passed to workers."""
 
 
 class _Worker:
-    """What an actor runs."""
+    """The class of the actors."""
 
     def __init__(self, work: Callable[[Any], Any], folder: str) -> None:
         self._work = work
-        with suppress(FileNotFoundError):  # so that relative paths mean the same, where this node has the folder
+        with suppress(FileNotFoundError):  # so that relative paths work, where this node has the folder
             os.chdir(folder)
 
     def start(self) -> None:
-        """Return when the actor is there."""
+        """Return once the actor has started."""
 
     def do(self, name: str, job: Any) -> tuple[str, Any]:
-        """Do a job; a refusal is a result too, so that Ray does not wrap it."""
+        """Do a job; an error is returned as a result, so that Ray does not wrap it."""
         try:
             return name, self._work(job)
         except Exception as error:
@@ -47,17 +47,17 @@ class _Worker:
 def run_jobs(
     work: Callable[[Job], Result], jobs: Mapping[str, Job], *, n_workers: int | None = None, device: str = "cpu"
 ) -> Iterator[tuple[str, Result]]:
-    """Yield the name and the result of ``work(job)`` for every job, the first that is done first.
+    """Yield the name and the result of ``work(job)`` for every job, in the order in which they finish.
 
-    The cluster is that of ``RAY_ADDRESS``, or of the caller's own ``ray.init``; else one is started on this machine for
-    the time of the work.
+    The cluster is that of ``RAY_ADDRESS``, or of the caller's own ``ray.init``; else one is started on this machine
+    until the work is done.
 
-    There are `n_workers` at most, by default one per GPU, or one per core where there are none. Unless `device` is
-    ``cpu``, each worker gets a GPU of its own where there are any.
+    There are at most `n_workers`, by default one per GPU, or one per core without GPUs. Unless `device` is ``cpu``,
+    each worker has a GPU of its own where there are any.
 
     Raises:
-        BadInput: Ray is not installed, or the device is not one that its workers have.
-        ZestError: the cluster cannot be joined, or a job's worker died again and again.
+        BadInput: Ray is not installed, or its workers lack the device.
+        ZestError: the cluster cannot be joined, or a job's worker died repeatedly.
     """
     if importlib.util.find_spec("ray") is None:
         raise BadInput("engine 'ray' needs Ray: pip install 'zest-rl[ray]', or use engine 'local'")
@@ -83,7 +83,7 @@ def run_jobs(
         actors = [actor_class.remote(work, str(Path.cwd())) for _ in range(n_actors)]
         pool: Any = ActorPool(actors)
         try:
-            for _ in actors:  # jobs go only to those that have started: a busy cluster may have no place for the others
+            for _ in actors:  # jobs go only to actors that have started: a busy cluster may lack room for some
                 pool.submit(lambda actor, _: actor.start.remote(), None)
             for job in jobs.items():
                 pool.submit(lambda actor, job: actor.do.remote(*job), job)
@@ -111,8 +111,8 @@ def _cluster(n_workers: int | None) -> Iterator[None]:
     if ray.is_initialized():
         yield
         return
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers otherwise
-    settings = {name: value for name, value in os.environ.items() if name.startswith(HANDED_ON)}
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # otherwise Ray reports usage to its makers
+    settings = {name: value for name, value in os.environ.items() if name.startswith(PASSED_VARIABLES)}
     options: dict[str, Any] = {"runtime_env": {"env_vars": settings}, "log_to_driver": False, "logging_level": "error"}
     if address := os.environ.get("RAY_ADDRESS"):
         _join(address, options)
