@@ -299,15 +299,16 @@ class Dataset:
 
     def _actions(self, group: h5py.Group, discrete: bool) -> FloatArray:
         actions = self._array(group, "actions", np.float32)
-        whole = acts_discretely(group)
-        if whole and not discrete:
+        is_discrete = acts_discretely(group)
+        if is_discrete and not discrete:
             raise BadInput("its actions are discrete, a policy here acts by continuous ones; `zest export` takes them")
-        return actions.reshape(len(actions), math.prod(actions.shape[1:])) if actions.ndim > 1 or whole else actions
+        return (
+            actions.reshape(len(actions), math.prod(actions.shape[1:])) if actions.ndim > 1 or is_discrete else actions
+        )
 
 
-def _verified_metadata(dataset_id: str) -> dict[str, Any]:
+def _verified_metadata(dataset_id: str, folder: Path) -> dict[str, Any]:
     """Return a dataset's metadata after comparing its files with their hashes; raises as `open_dataset`."""
-    folder = dataset_path(dataset_id)
     if not exists(dataset_id):
         raise BadInput(
             f"there is no dataset {dataset_id!r} under the Minari root; {nearest(dataset_id, list_datasets())}. "
@@ -339,7 +340,8 @@ def open_dataset(dataset_id: str) -> Iterator[Dataset]:
             missing episodes.
         ZestError: a file is damaged or was changed since it was written.
     """
-    metadata, path = _verified_metadata(dataset_id), dataset_path(dataset_id)
+    path = dataset_path(dataset_id)
+    metadata = _verified_metadata(dataset_id, path)
     try:
         file = h5py.File(path / DATA_FILE, "r")
     except OSError as error:

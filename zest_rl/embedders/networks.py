@@ -47,8 +47,8 @@ def build(uri: str) -> Network:
     if family not in builders and family in registered:
         return _build_registered(uri, rest, registered[family])
     if family not in builders:
-        known = (checkpoints.DEFAULT_EMBEDDER, "moco", "transformers", *builders, *registered)
-        raise BadInput(f"unknown embedder {uri!r}; {nearest(family, known)}")
+        families = (checkpoints.DEFAULT_EMBEDDER, "moco", "transformers", *builders, *registered)
+        raise BadInput(f"unknown embedder {uri!r}; {nearest(family, families)}")
     name, at, file = rest.partition("@")
     model, _, tag = name.partition("/")
     return builders[family](uri, model, tag, Path(file).expanduser() if at else None)
@@ -183,10 +183,10 @@ def _build_torchvision(uri: str, model: str, tag: str, path: Path | None) -> Net
 
     if model not in _RESNETS:
         raise BadInput(f"unknown torchvision model {model!r}; {nearest(model, _RESNETS)}")
-    known = models.get_model_weights(model)
-    if tag and tag not in known.__members__:
-        raise BadInput(f"unknown weights {tag!r} of torchvision:{model}; {nearest(tag, known.__members__)}")
-    weights = known[tag or "DEFAULT"]
+    tags = models.get_model_weights(model)
+    if tag and tag not in tags.__members__:
+        raise BadInput(f"unknown weights {tag!r} of torchvision:{model}; {nearest(tag, tags.__members__)}")
+    weights = tags[tag or "DEFAULT"]
     if path is None:
         path = Path(torch.hub.get_dir()) / "checkpoints" / Path(weights.url).name
         if not path.is_file():
@@ -203,8 +203,8 @@ def _build_moco(path: Path) -> Network:
     from torchvision import models
 
     prefix = "encoder_q."
-    whole = checkpoints.read_checkpoint(path)
-    state = {name.removeprefix(prefix): value for name, value in whole.items() if name.startswith(prefix)}
+    checkpoint = checkpoints.read_checkpoint(path)
+    state = {name.removeprefix(prefix): value for name, value in checkpoint.items() if name.startswith(prefix)}
     if not state:
         raise BadInput(f"{path} is not a checkpoint of MoCo v1 or v2: no key starts with module.{prefix}")
     return _resnet("resnet50", state, path, models.ResNet50_Weights.IMAGENET1K_V1.transforms())

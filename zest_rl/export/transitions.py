@@ -85,8 +85,8 @@ def shape_rewards(
         ]
     counted = [rewards[-1:] if shape == "terminal" else rewards for rewards in episodes]
     if normalise:
-        every = np.concatenate(counted)
-        low, size = every.min(), np.ptp(every)
+        pooled = np.concatenate(counted)
+        low, size = pooled.min(), np.ptp(pooled)
         if size == 0:
             raise BadInput("rewards that are all equal cannot be normalised; leave --normalise out")
         counted = [((rewards - low) / size).astype(np.float32) for rewards in counted]

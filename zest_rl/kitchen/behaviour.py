@@ -28,6 +28,7 @@ from zest_rl.runtime.parallel import cached_jobs, chunks, read_parts
 from zest_rl.types import FloatArray
 
 EPISODES_PER_JOB = 5
+_ARRAYS = ("obs", "actions", "qpos", "qvel", "gt_reward", "gt_success")  # of a `Recording`
 STOP_BETWEEN = (0.1, 1.0)
 _CODE = ("behaviour.py", "env.py", "arm.py", "experts.py", "tasks.py")  # with the behaviour, determines an episode
 
@@ -80,7 +81,7 @@ def rollout(behaviour: Behaviour, index: int) -> Arrays:
     manner, bias = draw_manner(behaviour, np.random.default_rng(manner_seed))
     env = gymnasium.make(env_spec(behaviour.task, behaviour.init_noise))
     expert = make_expert(behaviour.task, env, manner)
-    steps: dict[str, list[Any]] = {name: [] for name in ("obs", "actions", "qpos", "qvel", "gt_reward", "gt_success")}
+    steps: dict[str, list[Any]] = {name: [] for name in _ARRAYS}
 
     def record(obs: FloatArray, info: dict[str, Any]) -> None:
         steps["obs"].append(obs)
@@ -96,12 +97,12 @@ def rollout(behaviour: Behaviour, index: int) -> Arrays:
         obs, _, _, _, info = env.step(steps["actions"][-1])
         record(obs, info)
     env.close()
-    episode = {name: np.stack(values)[None] for name, values in steps.items()}
-    drawn = {"level": level, "stop_at": manner.stop_at, "speed": manner.speed}
     return {
-        **episode,
+        **{name: np.stack(values)[None] for name, values in steps.items()},
         "seed": np.array([env_seed], dtype=np.int64),
-        **{name: np.array([value]) for name, value in drawn.items()},
+        "level": np.array([level]),
+        "stop_at": np.array([manner.stop_at]),
+        "speed": np.array([manner.speed]),
     }
 
 
@@ -168,15 +169,6 @@ def returns(episodes: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
 def recordings(episodes: Mapping[str, NDArray[Any]]) -> list[Recording]:
     """Turn stacked episodes into recordings for `zest_rl.data.writer.write_dataset`."""
     return [
-        Recording(
-            seed=int(episodes["seed"][i]),
-            obs=episodes["obs"][i],
-            actions=episodes["actions"][i],
-            terminated=False,
-            qpos=episodes["qpos"][i],
-            qvel=episodes["qvel"][i],
-            gt_reward=episodes["gt_reward"][i],
-            gt_success=episodes["gt_success"][i],
-        )
-        for i in range(len(episodes["seed"]))
+        Recording(seed=int(seed), terminated=False, **{name: episodes[name][i] for name in _ARRAYS})
+        for i, seed in enumerate(episodes["seed"])
     ]

@@ -57,12 +57,7 @@ def missing(videos: Iterable[Video]) -> dict[Path, Video]:
 def ensure_videos(
     videos: Iterable[Video], *, n_workers: int | None = None, on_done: Callable[[], None] = lambda: None
 ) -> None:
-    """Write the `missing` videos, one process per core.
-
-    Args:
-        videos: existing ones are skipped.
-        n_workers: number of processes, default one per core.
-        on_done: called after each.
+    """Write the `missing` videos, by default with one process per core; `on_done` is called after each.
 
     Raises:
         ZestError: a process died; finished videos are kept.

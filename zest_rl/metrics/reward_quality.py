@@ -72,13 +72,13 @@ def share_explained_by_step(scores: Sequence[FloatArray]) -> Estimate:
     padded = np.full((len(scores), length), np.nan)
     for row, score in zip(padded, scores, strict=True):
         row[: len(score)] = score
-    known = np.isfinite(padded)
-    filled = np.where(known, padded, 0.0)
-    others = known.sum(axis=0) - known  # how many other episodes have this step
+    present = np.isfinite(padded)
+    filled = np.where(present, padded, 0.0)
+    others = present.sum(axis=0) - present  # how many other episodes have this step
     by_step = np.divide(filled.sum(axis=0) - filled, others, out=np.zeros_like(filled), where=others > 0)
-    lengths = known.sum(axis=1)
+    lengths = present.sum(axis=1)
     by_all = (filled.sum() - filled.sum(axis=1)) / np.maximum(lengths.sum() - lengths, 1)
-    compared = known & (others > 0)
+    compared = present & (others > 0)
     error = np.where(compared, (filled - by_step) ** 2, 0.0).sum(axis=1)
     distance = np.where(compared, (filled - by_all[:, None]) ** 2, 0.0).sum(axis=1)
 
@@ -107,12 +107,12 @@ def share_saturated(scores: Sequence[FloatArray]) -> Estimate:
     NaN for constant scores.
     """
     _check_pairs("scores", scores, scores)
-    every = np.concatenate(scores)
-    low, high = float(every.min()), float(every.max())
+    pooled = np.concatenate(scores)
+    low, high = float(pooled.min()), float(pooled.max())
     if low == high:
         return Estimate(float("nan"), float("nan"), float("nan"))
-    place = [(score - low) / (high - low) for score in scores]
-    shares = np.array([((p < SATURATED_BAND) | (p > 1 - SATURATED_BAND)).mean() for p in place])
+    scaled = [(score - low) / (high - low) for score in scores]
+    shares = np.array([((s < SATURATED_BAND) | (s > 1 - SATURATED_BAND)).mean() for s in scaled])
     return _mean_over_frames(shares, scores)
 
 
@@ -194,8 +194,8 @@ def epic_distance(scores: Sequence[FloatArray], truth: Sequence[FloatArray]) -> 
         truth: (T,) per episode, the ground-truth rewards.
     """
     _check_pairs("ground-truth rewards", scores, truth)
-    every = [np.asarray(np.concatenate(rewards), dtype=np.float64) for rewards in (scores, truth)]
-    offsets, largest = [values.mean() for values in every], [np.abs(values).max() for values in every]
+    pooled = [np.asarray(np.concatenate(rewards), dtype=np.float64) for rewards in (scores, truth)]
+    offsets, largest = [values.mean() for values in pooled], [np.abs(values).max() for values in pooled]
     sums = np.empty((len(scores), 6))
     for row, score, reward in zip(sums, scores, truth, strict=True):
         a, b = score - offsets[0], reward - offsets[1]

@@ -76,15 +76,10 @@ class FrameEmbeddings:
         n_workers: int | None = None,
         engine: Engine = "local",
     ) -> None:
-        """Hash the frames.
+        """Hash the frames of a source.
 
-        Args:
-            source: the dataset.
-            embedder: its URI; `precision` and `device` as in `zest_rl.embedders.load_embedder`.
-            precision: of the embedder.
-            device: of the embedder.
-            n_workers: processes that embed, default one per core.
-            engine: processes of this machine, or workers of a Ray cluster.
+        `embedder` is a URI, `precision` and `device` as in `zest_rl.embedders.load_embedder`; `n_workers` and `engine`
+        as in `zest_rl.runtime.parallel.run_jobs`.
 
         Raises:
             BadInput: frames or the embedder cannot be read.
@@ -150,8 +145,9 @@ class FrameEmbeddings:
             frames = arrays["embeddings"]
             if len(frames) not in (n_steps, n_steps + 1):
                 raise BadInput(f"episode {i} has {n_steps} actions and {len(frames)} frames")
-            whole = frames if len(frames) == n_steps + 1 else np.concatenate([frames, frames[-1:]])
-            yield EmbeddedEpisode(whole, np.arange(n_steps + 1))
+            if len(frames) == n_steps:
+                frames = np.concatenate([frames, frames[-1:]])
+            yield EmbeddedEpisode(frames, np.arange(n_steps + 1))
 
     def _path(self, digest: str) -> Path:
         return self._folder / f"{digest[:32]}.npz"

@@ -155,13 +155,13 @@ class Scorer:
     def fingerprint(self) -> str:
         """Hash of everything that a score depends on besides the frames; names of files and folders do not matter."""
         config = self.config
-        how = {"features": config.features, "similarity": config.similarity, "goal_share": config.goal_share}
+        settings = {"features": config.features, "similarity": config.similarity, "goal_share": config.goal_share}
         rule = [] if config.goal_share == 1 else ["by last frames"]
         numbers = [f"{name} {number}" for name, number in NUMBERS.items() if name == config.features]
         hashes: list[Any] = [self.goal_sha256, self.embedder_sha256]
         if self.views is not None:
             hashes = [[*hashes, self.views.fingerprint()]]
-        return artifacts.hash_json([how, *rule, *numbers, *hashes])
+        return artifacts.hash_json([settings, *rule, *numbers, *hashes])
 
     def save(self, path: Path) -> None:
         """Write the goal's embeddings and the config as one safetensors file."""

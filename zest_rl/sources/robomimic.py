@@ -65,15 +65,19 @@ def open_robomimic(
         with h5py.File(path, "r") as file:
             demos = file.get("data")
             members = [name for name in demos if name.startswith("demo_")] if isinstance(demos, h5py.Group) else []
-            odd = [name for name in members if not name.removeprefix("demo_").isdecimal()]
-            if odd:
-                raise BadInput(f"episodes must be named data/demo_0, data/demo_1, …, got data/{odd[0]} in {path}")
+            misnamed = [name for name in members if not name.removeprefix("demo_").isdecimal()]
+            if misnamed:
+                raise BadInput(f"episodes must be named data/demo_0, data/demo_1, …, got data/{misnamed[0]} in {path}")
             names = [f"data/{name}" for name in sorted(members, key=lambda name: int(name.removeprefix("demo_")))]
-            lacking = [name for name in names if "actions" not in file[name] or "obs" not in file[name]]
-            if not names or lacking:
+            incomplete = [name for name in names if "actions" not in file[name] or "obs" not in file[name]]
+            if not names or incomplete:
                 raise BadInput(
                     f"{path} must hold data/demo_0, … with actions and obs/, as robomimic's files do; "
-                    + (f"{lacking[0]} lacks one of them (extract observations first)" if lacking else "it has none")
+                    + (
+                        f"{incomplete[0]} lacks one of them (extract observations first)"
+                        if incomplete
+                        else "it has none"
+                    )
                 )
             n_steps = tuple(len(file[name]["actions"]) for name in names)
             numbers = [e for e in entries(file[names[0]]["obs"]).values() if is_numbers(e)]

@@ -74,8 +74,8 @@ class States:
         versions = [importlib.metadata.version(name) for name in ("mujoco", "gymnasium", "gymnasium-robotics")]
         recorded = self.read_states(episode)
         model = stage_of(self.env_spec, self.cameras).model_sha256
-        how = [self.env_spec, versions, model, self.cameras, self.pose, SIZE, _VERSION, sorted(recorded)]
-        return artifacts.hash_json([artifacts.hash_arrays(*(recorded[name] for name in sorted(recorded))), how])
+        settings = [self.env_spec, versions, model, self.cameras, self.pose, SIZE, _VERSION, sorted(recorded)]
+        return artifacts.hash_json([artifacts.hash_arrays(*(recorded[name] for name in sorted(recorded))), settings])
 
     def read(self, episode: int) -> Iterator[Sequence[Frame]]:
         """Render each state."""
