@@ -30,7 +30,7 @@ from zest_rl.evaluation.evaluate import (
     read_evaluation,
     target_return,
 )
-from zest_rl.evaluation.rollout import Arrays, run_episodes
+from zest_rl.evaluation.rollout import Traces, run_episodes
 from zest_rl.kitchen.env import ENV_ID, HORIZON, KitchenEnv, env_spec
 from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.rewards.state_scorer import StateScorer
@@ -72,12 +72,12 @@ class Replay:
 
 
 @pytest.fixture
-def replay(trained: Path) -> Callable[..., tuple[Replay, Arrays]]:
+def replay(trained: Path) -> Callable[..., tuple[Replay, Traces]]:
     """Roll out the policy of a run along the first recorded episode, in which the microwave opens."""
     seed = int(np.random.SeedSequence([0, 0]).generate_state(2)[0])  # as `zest_rl.kitchen.behaviour.rollout` draws it
     actions = read(COLLECTED, Dataset.episodes)[0].actions
 
-    def play(name: str, config: EvaluationConfig = ONLINE, scorer: StateScorer | None = None) -> tuple[Replay, Arrays]:
+    def play(name: str, config: EvaluationConfig = ONLINE, scorer: StateScorer | None = None) -> tuple[Replay, Traces]:
         policy = Replay(trained / name, actions)
         target = target_return(policy, config)
         seeds = range(seed, seed + 1)
@@ -86,7 +86,7 @@ def replay(trained: Path) -> Callable[..., tuple[Replay, Arrays]]:
     return play
 
 
-def assert_equal(one: Arrays, other: Arrays) -> None:
+def assert_equal(one: Traces, other: Traces) -> None:
     assert one.keys() == other.keys()
     for name, array in one.items():
         np.testing.assert_array_equal(array, other[name], err_msg=name)
@@ -148,7 +148,7 @@ def test_an_evaluation_killed_midway_goes_on_and_ends_with_the_same_bits(trained
 
 
 def test_the_return_to_go_falls_by_the_score_of_each_new_state(
-    trained: Path, replay: Callable[..., tuple[Replay, Arrays]]
+    trained: Path, replay: Callable[..., tuple[Replay, Traces]]
 ) -> None:
     policy, traces = replay("dt-0", scorer=load_scorer(trained / "dt-0"))
     np.testing.assert_array_equal(np.stack(policy.told, axis=1), traces["score"][:, 1:])
@@ -161,14 +161,14 @@ def test_the_return_to_go_falls_by_the_score_of_each_new_state(
 
 
 def test_rewards_that_are_differences_of_scores_make_it_fall_by_differences(
-    trained: Path, replay: Callable[..., tuple[Replay, Arrays]]
+    trained: Path, replay: Callable[..., tuple[Replay, Traces]]
 ) -> None:
     edit_meta(trained / "dt-0", lambda meta: meta["dataset"]["zest"]["relabel"].update(reward="difference"))
     policy, traces = replay("dt-0", scorer=load_scorer(trained / "dt-0"))
     np.testing.assert_array_equal(np.stack(policy.told, axis=1), np.diff(traces["score"], axis=1))
 
 
-def test_a_constant_return_to_go_never_falls(replay: Callable[..., tuple[Replay, Arrays]]) -> None:
+def test_a_constant_return_to_go_never_falls(replay: Callable[..., tuple[Replay, Traces]]) -> None:
     policy, traces = replay("dt-0", CONSTANT)
     assert "score" not in traces
     assert len(policy.told) == HORIZON
@@ -176,7 +176,7 @@ def test_a_constant_return_to_go_never_falls(replay: Callable[..., tuple[Replay,
 
 
 def test_a_scheduled_return_to_go_is_that_of_the_best_training_episode(
-    replay: Callable[..., tuple[Replay, Arrays]],
+    replay: Callable[..., tuple[Replay, Traces]],
 ) -> None:
     policy, _ = replay("dt-0", replace(ONLINE, rtg="schedule"))
     schedule = np.array(policy.meta["rtg_schedule"], dtype=np.float32)
@@ -184,14 +184,14 @@ def test_a_scheduled_return_to_go_is_that_of_the_best_training_episode(
     np.testing.assert_allclose(schedule[0] - np.cumsum(policy.told), schedule[1:], atol=1e-4)
 
 
-def test_a_policy_of_the_ground_truth_is_told_the_ground_truth(replay: Callable[..., tuple[Replay, Arrays]]) -> None:
+def test_a_policy_of_the_ground_truth_is_told_the_ground_truth(replay: Callable[..., tuple[Replay, Traces]]) -> None:
     policy, traces = replay("gt-0")
     np.testing.assert_array_equal(np.stack(policy.told, axis=1), traces["gt_reward"][:, 1:])
     assert traces["gt_reward"].max() > 0.5
 
 
 def test_the_ground_truth_never_reaches_a_policy_of_the_scores(
-    trained: Path, replay: Callable[..., tuple[Replay, Arrays]], monkeypatch: pytest.MonkeyPatch
+    trained: Path, replay: Callable[..., tuple[Replay, Traces]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scorer = load_scorer(trained / "dt-0")
 

@@ -27,11 +27,11 @@ from zest_rl.report.content import (
     Curve,
     EpisodePanel,
     GoalPanel,
-    Matrix,
     MethodRow,
     QualityRow,
     QualityTable,
     Scatter,
+    ScoreMatrix,
     Strip,
     TaskTable,
 )
@@ -49,7 +49,7 @@ from zest_rl.report.sections import (
     REWARD_QUALITY,
     SCORES_OVER_TIME,
     SUB_GOALS,
-    TASKS,
+    TASK_TABLES,
     TASKS_AGAINST_GOALS,
     VIEWS,
     WARNINGS,
@@ -106,13 +106,13 @@ def report(video: Path) -> Report:
         "The reward ranks episodes.",
         (
             RESULTS(rows),
-            TASKS((TaskTable("one task", rows, "#task"),)),
+            TASK_TABLES((TaskTable("one task", rows, "#task"),)),
             CAVEATS(("three seeds only",)),
             WARNINGS(("the reward is a clock",)),
             REWARD_QUALITY((QualityTable(("delta", "raw"), quality),)),
             TASKS_AGAINST_GOALS(
                 (
-                    Matrix(
+                    ScoreMatrix(
                         ("door", "knob"),
                         ("delta", "raw", "text"),
                         means,
@@ -255,7 +255,7 @@ def test_figures_that_are_not_finite_are_shown_as_a_dash(report: Report) -> None
         LEARNING_CURVES((Curve("BC", "loss", np.zeros(2, np.float32), np.full(2, nan, np.float32)),)),
         DETAILS((("config", {"target": nan, "limits": [inf, np.float32("nan")], "array": np.array([nan])}),)),
         REWARD_QUALITY((QualityTable(("d",), (QualityRow("q", "m", ((nan, nan, inf),)),)),)),
-        TASKS_AGAINST_GOALS((Matrix(("d",), ("d",), *np.full((3, 1, 1), nan, np.float32)),)),
+        TASKS_AGAINST_GOALS((ScoreMatrix(("d",), ("d",), *np.full((3, 1, 1), nan, np.float32)),)),
         FRAMES((dataclasses.replace(report.items(FRAMES)[0], scores=np.array([nan, inf], np.float32)),)),
     )
     html = render_html(broken)
@@ -310,7 +310,7 @@ def test_parts_that_do_not_fit_together_are_refused(report: Report) -> None:
     with pytest.raises(BadInput, match="got x 3, y 4"):
         Scatter("s", three, four, 0.0)
     with pytest.raises(BadInput, match=r"2 sources and 1 goals must have shape \(2, 1\), got \(1, 2\)"):
-        Matrix(("door", "knob"), ("delta",), *np.zeros((3, 1, 2), np.float32))
+        ScoreMatrix(("door", "knob"), ("delta",), *np.zeros((3, 1, 2), np.float32))
     with pytest.raises(BadInput, match="got steps 3, values 3, low 4, high 4"):
         Curve("BC", "loss", three, three, (four, four))
     with pytest.raises(BadInput, match=r"unknown kind 'metod'; did you mean 'method'"):

@@ -102,8 +102,8 @@ def test_alone_nothing_is_shared_or_averaged() -> None:
 
 DISAGREE = """
 import torch
-from zest_rl.training.distributed import joined
-with joined(torch.device("cpu")) as group:
+from zest_rl.training.distributed import process_group
+with process_group(torch.device("cpu")) as group:
     group.agree(finished=False)
     group.agree(updates_done=40 * group.rank)
 """

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Generic, Literal, Protocol, TypeVar, get_args
+from typing import Any, Generic, Protocol, TypeVar, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from zest_rl.embedders import Precision, computes_bf16
 from zest_rl.errors import BadInput
 from zest_rl.types import Episode, FloatArray
 
 Batch = dict[str, Tensor]
 Sampler = Callable[[np.random.Generator], Batch]
-Precision = Literal["auto", "bf16", "fp32"]
 
 # The Decision Transformer's code divides by std + 1e-6: a joint that never moved in the data would become a huge number
 # once it moves. Hence a floor (rad or m, as the kitchen's observations) and a bound (in standard deviations).
@@ -105,9 +104,7 @@ def resolve_precision(precision: Precision, device: torch.device) -> Precision:
         return precision
     if device.type == "cuda":
         return "bf16" if torch.cuda.is_bf16_supported() else "fp32"
-    cpuinfo = Path("/proc/cpuinfo")  # Linux only
-    flags = set(cpuinfo.read_text().split()) if cpuinfo.exists() else set()
-    return "bf16" if flags & {"avx512_bf16", "amx_bf16", "bf16"} else "fp32"
+    return "bf16" if computes_bf16("cpu") else "fp32"
 
 
 def autocast(precision: Precision, device: torch.device) -> torch.autocast:

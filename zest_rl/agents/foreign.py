@@ -216,10 +216,10 @@ class ForeignPolicy:
         check_obs(obs, len(self._n_clipped), self.meta["obs_dim"])
         with self._naming_the_policy(f"obs of shape {obs.shape}"):
             actions: FloatArray = np.asarray(self._act(obs), dtype=np.float32)
-        wanted = (len(obs), self.meta["act_dim"])
-        if actions.shape != wanted:
+        expected = (len(obs), self.meta["act_dim"])
+        if actions.shape != expected:
             raise ZestError(
-                f"{self._name} must give actions of shape {wanted} for obs {obs.shape}, got {actions.shape}"
+                f"{self._name} must give actions of shape {expected} for obs {obs.shape}, got {actions.shape}"
             )
         bad = np.flatnonzero(~np.isfinite(actions).all(axis=1))
         if len(bad):

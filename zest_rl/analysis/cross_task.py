@@ -80,7 +80,7 @@ def confusion(
 
 
 def _source(inspection: Inspection) -> tuple[str, str]:
-    return inspection.made.source, inspection.made.source_sha256
+    return inspection.relabel.source, inspection.relabel.source_sha256
 
 
 def confusion_warnings(inspections: Sequence[Inspection], compared: Confusion) -> dict[str, str]:

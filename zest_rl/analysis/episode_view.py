@@ -76,7 +76,7 @@ def best_and_worst(inspection: Inspection, *, n_workers: int | None = None) -> d
     Raises:
         ZestError: the scorer is missing, or was made with another embedder or renderer than those installed.
     """
-    if inspection.made.shuffle is not None or inspection.states is None:
+    if inspection.relabel.shuffle is not None or inspection.states is None:
         return {}
     scorer = StateScorer.load(dataset_path(inspection.dataset_id) / SCORER_FILE, n_workers=n_workers)
     chosen = {"best": np.argmax(inspection.returns), "worst": np.argmin(inspection.returns)}

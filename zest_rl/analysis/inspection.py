@@ -27,7 +27,7 @@ class Inspection:
     dataset_id: str
     task: str
     """Kitchen task; of another robot, the id of the dataset that was relabeled."""
-    made: RelabelRecord
+    relabel: RelabelRecord
     """How it was relabeled."""
     figures: Mapping[str, Estimate]
     """By the keys of `FIGURES`; those that need ground truth or states are missing where there are none."""
@@ -55,8 +55,8 @@ def inspect(dataset_id: str) -> Inspection:
         BadInput: there is no such dataset, it was not relabeled, or it has fewer than 3 episodes.
     """
     with open_dataset(dataset_id) as ds:
-        made = ds.record.relabel
-        if made is None:
+        record = ds.record.relabel
+        if record is None:
             raise BadInput(
                 f"dataset {dataset_id} holds no ZeST scores; run `zest relabel {dataset_id}` and inspect that"
             )
@@ -65,7 +65,7 @@ def inspect(dataset_id: str) -> Inspection:
             raise BadInput(
                 f"rewards can be judged on at least {MIN_EPISODES_TO_RANK} episodes, {dataset_id} has {len(rewards)}"
             )
-        views = None if made.scorer.views is None else Views(**made.scorer.views)
+        views = None if record.scorer.views is None else Views(**record.scorer.views)
         states = None if views is None else ds.states()
         truth = ds.truth() if ds.has_truth else None
     frames, still = None, None
@@ -74,16 +74,16 @@ def inspect(dataset_id: str) -> Inspection:
         rendered = [canonical_states(episode, views) for episode in states]
         frames = [episode[1:] for episode in rendered]
         still = [(episode[1:] == episode[0]).all(axis=1) for episode in rendered]
-    elif (made.scorer.features, made.scorer.similarity) == ("delta", "cos") and made.shuffle is None:
+    elif (record.scorer.features, record.scorer.similarity) == ("delta", "cos") and record.shuffle is None:
         still = [episode == 0 for episode in after_actions]  # nothing else scores exactly 0
     figures = measure_rewards(rewards, after_actions, frames, still, truth)
     warnings = reward_warnings(rewards, figures)
-    if made.shuffle is not None:
+    if record.shuffle is not None:
         warnings.insert(0, "These are the scores of other episodes: the dataset was relabeled with --shuffle.")
     return Inspection(
         dataset_id,
-        made.source if views is None else views.task,
-        made,
+        record.source if views is None else views.task,
+        record,
         figures,
         tuple(warnings),
         _over_time(rewards, truth),
@@ -134,19 +134,19 @@ def names_with_settings(described: Sequence[tuple[str, Mapping[str, Any]]]) -> l
 
 
 def _goal(inspection: Inspection) -> str:
-    goal = Path(inspection.made.scorer.goal)
-    return goal.name if goal.is_absolute() else inspection.made.scorer.goal
+    goal = Path(inspection.relabel.scorer.goal)
+    return goal.name if goal.is_absolute() else inspection.relabel.scorer.goal
 
 
 def _settings(inspection: Inspection) -> dict[str, Any]:
     """Return the settings in which rewards of one task and goal may differ, by their name in a label."""
-    made, scorer = inspection.made, inspection.made.scorer
+    record, scorer = inspection.relabel, inspection.relabel.scorer
     return {
         "embedder": scorer.embedder,
         "features": scorer.features,
         "similarity": scorer.similarity,
-        "views": made.n_views,
+        "views": record.n_views,
         "share of goals": scorer.goal_share,
-        "reward": made.reward,
-        "shuffled": "no" if made.shuffle is None else made.shuffle,
+        "reward": record.reward,
+        "shuffled": "no" if record.shuffle is None else record.shuffle,
     }

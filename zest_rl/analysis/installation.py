@@ -136,9 +136,9 @@ def check_processor() -> Iterator[Check]:
     """Report what speeds up embedding and training on this machine: bf16 on the CPU, CUDA."""
     import torch
 
-    flags = Path("/proc/cpuinfo")
-    bf16 = "bf16" in flags.read_text() if flags.exists() else False
-    arithmetic = "bf16" if bf16 else "no bf16, so float32 (embedding takes about 3 times as long)"
+    from zest_rl.embedders import computes_bf16
+
+    arithmetic = "bf16" if computes_bf16("cpu") else "no bf16, so float32 (embedding takes about 3 times as long)"
     yield Check("cpu", "ok", f"{torch.get_num_threads()} threads, {arithmetic}")
     yield Check("gpu", "ok", torch.cuda.get_device_name() if torch.cuda.is_available() else "none; the CPU is used")
 

@@ -108,7 +108,7 @@ def load_embedder(
     if batch_size < 1:
         raise BadInput(f"batch_size must be at least 1, got {batch_size}")
     _check_device(device)
-    bf16 = precision == "bf16" or (precision == "auto" and _computes_bf16(device) and uri != DEFAULT_EMBEDDER)
+    bf16 = precision == "bf16" or (precision == "auto" and computes_bf16(device) and uri != DEFAULT_EMBEDDER)
 
     if uri == DEFAULT_EMBEDDER:
         weights = installed_weights()
@@ -192,7 +192,7 @@ def _check_device(device: str) -> None:
         raise BadInput(f"torch finds no device {device!r} on this machine; use 'auto' or 'cpu'")
 
 
-def _computes_bf16(device: str) -> bool:
+def computes_bf16(device: str) -> bool:
     """Whether the hardware computes bf16 natively; without torch, since fingerprints must not wait for its import."""
     if device.startswith("cuda") or (device == "auto" and Path("/proc/driver/nvidia/gpus").is_dir()):
         return True

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from zest_rl.agents import Policy, load_policy
 from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput, nearest
-from zest_rl.evaluation.rollout import Arrays, Rtg, run_episodes, uses_online_scores
+from zest_rl.evaluation.rollout import Rtg, Traces, run_episodes, uses_online_scores
 from zest_rl.kitchen.env import ENV_ID
 from zest_rl.kitchen.videos import Video, ensure_videos
 from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return, representative, wilson
@@ -75,7 +75,7 @@ class Evaluation:
     expert: float
     """Ground-truth returns that count as 0 % and 100 %."""
     episodes: tuple[EpisodeResult, ...]
-    traces: Arrays
+    traces: Traces
     """What `run_episodes` returns: gt_reward, gt_success (N, T+1), qpos (N, T+1, nq), score (N, T+1) when scored, and
     of a foreign policy clipped (N,), the number of actions that left [-1, 1]."""
 
@@ -119,7 +119,7 @@ def _scorer(path: Path, sha256: str) -> StateScorer:
     return StateScorer.load(path, n_workers=1)
 
 
-def _evaluate_part(job: tuple[Path, EvaluationConfig, range, bool, str]) -> Arrays:
+def _evaluate_part(job: tuple[Path, EvaluationConfig, range, bool, str]) -> Traces:
     run, config, seeds, scored, device = job
     policy = load_policy(run, device=device)
     scorer = _scorer(run / SCORER_FILE, artifacts.hash_file(run / SCORER_FILE)) if scored else None
@@ -264,7 +264,7 @@ def episode_videos(evaluation: Evaluation) -> dict[str, Video]:
     }
 
 
-def _episode_results(traces: Arrays, config: EvaluationConfig) -> tuple[EpisodeResult, ...]:
+def _episode_results(traces: Traces, config: EvaluationConfig) -> tuple[EpisodeResult, ...]:
     n_episodes, n_frames = traces["gt_reward"].shape
     return tuple(
         EpisodeResult(

@@ -23,7 +23,7 @@ from zest_rl.types import FloatArray
 
 Rtg = Literal["online", "constant", "schedule"]
 """How the return-to-go falls: by the online ZeST score, not at all, or as in the best training episode."""
-Arrays = dict[str, NDArray[Any]]
+Traces = dict[str, NDArray[Any]]
 
 
 def uses_online_scores(policy: Policy, rtg: Rtg) -> bool:
@@ -38,7 +38,7 @@ def run_episodes(
     rtg: Rtg = "online",
     target_return: float | None = None,
     scorer: StateScorer | None = None,
-) -> Arrays:
+) -> Traces:
     """Run one episode per seed in the environment of the policy's dataset.
 
     Args:
@@ -110,7 +110,7 @@ def _kitchen_spec(env_spec: str) -> gymnasium.envs.registration.EnvSpec:
     return spec
 
 
-def _ground_truth(infos: Sequence[Mapping[str, Any]]) -> Arrays:
+def _ground_truth(infos: Sequence[Mapping[str, Any]]) -> Traces:
     """Return gt_reward (N,), gt_success (N,) and qpos (N, nq) of one time step."""
     return {
         "gt_reward": np.array([info["gt"]["reward"] for info in infos]),

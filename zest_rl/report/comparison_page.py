@@ -22,7 +22,17 @@ from zest_rl.report.content import Curve, MethodRow, TaskTable
 from zest_rl.report.episodes import paired_episodes, representative_episodes
 from zest_rl.report.goals import goal_panel, goal_scatter
 from zest_rl.report.methods import Method, goal_name, latest_evaluation, methods_of_runs, read_meta
-from zest_rl.report.sections import CAVEATS, DETAILS, EPISODES, GOALS, LEARNING_CURVES, RANKING, RESULTS, TASKS, Report
+from zest_rl.report.sections import (
+    CAVEATS,
+    DETAILS,
+    EPISODES,
+    GOALS,
+    LEARNING_CURVES,
+    RANKING,
+    RESULTS,
+    TASK_TABLES,
+    Report,
+)
 from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.training.checkpoints import snapshots
@@ -253,7 +263,7 @@ def overview(
         _best_sentence(rows, f" over {len(reports)} datasets"),
         (
             RESULTS(rows),
-            TASKS(TaskTable(task, report.items(RESULTS), pages[task]) for task, report in reports.items()),
+            TASK_TABLES(TaskTable(task, report.items(RESULTS), pages[task]) for task, report in reports.items()),
             CAVEATS(caveats),
             RANKING(replace(scatter, name=f"{task}: {scatter.name}") for task, scatter in scatters),
             LEARNING_CURVES(replace(curve, quantity=f"{task}: {curve.quantity}") for task, curve in curves),

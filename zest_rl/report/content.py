@@ -211,7 +211,7 @@ class QualityTable:
 
 
 @dataclass(frozen=True)
-class Matrix:
+class ScoreMatrix:
     """Mean score of the last frames of each source's episodes (rows), by the goal of each dataset (columns)."""
 
     episodes: tuple[str, ...]

@@ -33,12 +33,12 @@ def return_scatter(name: str, returns: Values, truth: Values, rho: Estimate) -> 
     return Scatter(name, truth.astype(np.float32), returns.astype(np.float32), rho.value, (rho.low, rho.high))
 
 
-def goal_panel(name: str, made: RelabelRecord, folder: Path, scatter: Scatter | None = None) -> GoalPanel:
+def goal_panel(name: str, record: RelabelRecord, folder: Path, scatter: Scatter | None = None) -> GoalPanel:
     """Return the goal of a relabeled dataset, as pictures or sentences.
 
     Args:
         name: of the goal in the report.
-        made: how the dataset was relabeled.
+        record: how the dataset was relabeled.
         folder: of the dataset.
         scatter: how the goal ranks episodes, if known.
     """
@@ -48,7 +48,9 @@ def goal_panel(name: str, made: RelabelRecord, folder: Path, scatter: Scatter | 
             tuple(read_image(path) for path in list_images(folder / GOAL_FOLDER / part)) for part in ("init", "goal")
         )
         return GoalPanel(name, start, goal, *ranking)
-    views = made.scorer.views
-    sentences = read_text(made.scorer.goal) if views is None else read_goal(made.scorer.goal, get_task(views["task"]))
-    kept = range(len(sentences.goals)) if made.kept_goals is None else made.kept_goals
+    views = record.scorer.views
+    sentences = (
+        read_text(record.scorer.goal) if views is None else read_goal(record.scorer.goal, get_task(views["task"]))
+    )
+    kept = range(len(sentences.goals)) if record.kept_goals is None else record.kept_goals
     return GoalPanel(name, sentences.starts, tuple(sentences.goals[k] for k in kept), *ranking)

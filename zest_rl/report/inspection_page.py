@@ -13,7 +13,7 @@ from zest_rl.analysis.inspection import Inspection, labels
 from zest_rl.analysis.reward_figures import FIGURES
 from zest_rl.data.reader import dataset_path
 from zest_rl.metrics.statistics import MIN_EPISODES_TO_RANK, spearman
-from zest_rl.report.content import Curve, Matrix, QualityRow, QualityTable, Scatter, Strip
+from zest_rl.report.content import Curve, QualityRow, QualityTable, Scatter, ScoreMatrix, Strip
 from zest_rl.report.goals import goal_panel, return_scatter
 from zest_rl.report.sections import (
     DETAILS,
@@ -39,7 +39,7 @@ def inspection_report(joint: JointInspection) -> Report:
         name: joint.views[each.dataset_id] for name, each in inspections.items() if joint.views.get(each.dataset_id)
     }
     ends = joint.confusion
-    matrices = [] if ends is None else [Matrix(ends.row_names(), names, ends.means, ends.low, ends.high)]
+    matrices = [] if ends is None else [ScoreMatrix(ends.row_names(), names, ends.means, ends.low, ends.high)]
     n_warnings = sum(map(len, joint.warnings.values()))
     return Report(
         "What these rewards are worth",
@@ -49,7 +49,7 @@ def inspection_report(joint: JointInspection) -> Report:
             REWARD_QUALITY([_quality(inspections)]),
             TASKS_AGAINST_GOALS(matrices),
             GOALS(
-                goal_panel(name, each.made, dataset_path(each.dataset_id), scatters[name])
+                goal_panel(name, each.relabel, dataset_path(each.dataset_id), scatters[name])
                 for name, each in inspections.items()
             ),
             RANKING(scatter for scatter in scatters.values() if scatter is not None),
@@ -57,7 +57,7 @@ def inspection_report(joint: JointInspection) -> Report:
             VIEWS(curve for name in views for curve in _by_view(name, views[name]["best"])),
             PIXELS(_pixels(name, views[name]["best"]) for name in views),
             SCORES_OVER_TIME(curve for name, each in inspections.items() for curve in _over_time(name, each)),
-            DETAILS((name, {"dataset": each.dataset_id, **each.made.to_json()}) for name, each in inspections.items()),
+            DETAILS((name, {"dataset": i.dataset_id, **i.relabel.to_json()}) for name, i in inspections.items()),
         ),
     )
 

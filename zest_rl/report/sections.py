@@ -13,10 +13,10 @@ from zest_rl.report.content import (
     Curve,
     EpisodePanel,
     GoalPanel,
-    Matrix,
     MethodRow,
     QualityTable,
     Scatter,
+    ScoreMatrix,
     Strip,
     TaskTable,
 )
@@ -75,7 +75,7 @@ RESULTS = SectionKind[MethodRow](
     "results.html",
     "100 % is the expert, 0 % is the robot that does nothing. Lines are 95 % bootstrap intervals.",
 )
-TASKS = SectionKind[TaskTable](
+TASK_TABLES = SectionKind[TaskTable](
     "Tasks",
     "tasks.html",
     "Each task on its own; its page has the goals, the episodes' videos and all settings.",
@@ -87,7 +87,7 @@ REWARD_QUALITY = SectionKind[QualityTable](
     "quality.html",
     "Small figures are 95 % bootstrap intervals over episodes. Ground truth judges a reward, it makes none.",
 )
-TASKS_AGAINST_GOALS = SectionKind[Matrix](
+TASKS_AGAINST_GOALS = SectionKind[ScoreMatrix](
     "Tasks against goals",
     "matrix.html",
     "Mean score of where episodes end; a goal should score those of its own task highest (bold: highest).",

@@ -120,7 +120,7 @@ def local_index() -> int:
 
 
 @contextmanager
-def joined(device: torch.device) -> Iterator[Group]:
+def process_group(device: torch.device) -> Iterator[Group]:
     """Join the processes that ``torchrun`` started while the context is open; a single process does nothing."""
     group = launched()
     if group.size == 1:

@@ -39,7 +39,7 @@ from zest_rl.agents.base import OptimizerConfig, autocast, check_fields, describ
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint, snapshot_folder
-from zest_rl.training.distributed import Group, joined, launched, local_index
+from zest_rl.training.distributed import Group, launched, local_index, process_group
 from zest_rl.training.log import MetricsLog
 from zest_rl.types import Episode
 
@@ -141,7 +141,7 @@ def fit(
     described = request | asdict(facts)
 
     with (
-        joined(device) as group,
+        process_group(device) as group,
         _claimed(run_dir, request, group) as finished,
         _torch_set_up(config.seed, request["threads"], device),
     ):
