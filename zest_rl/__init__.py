@@ -2,8 +2,8 @@
 
 goal spec + frames → embeddings → scores → relabeled dataset → trainer → policy → evaluation → report.
 
-One stage is one module and leaves one artifact on disk. The method is ZeST (Cui et al., "Can Foundation Models
-Perform Zero-Shot Task Specification For Robot Manipulation?", L4DC 2022). Importing this package imports nothing
+One stage is one room (a folder) and leaves one artifact on disk. The method is ZeST (Cui et al., "Can Foundation
+Models Perform Zero-Shot Task Specification For Robot Manipulation?", L4DC 2022). Importing this package imports nothing
 heavy; import the module of the stage you need.
 """
 

@@ -25,7 +25,7 @@ class Confusion:
     """Scores of the last frames of each source's episodes, by the goal of each dataset."""
 
     sources: Mapping[tuple[str, str], str]
-    """Id and sha256 of each relabeled dataset → its task; one row each, however often it was relabeled."""
+    """Id and sha256 of each source dataset → its task: one row per source, however often relabeled."""
     own_rows: tuple[int, ...]
     """Per dataset, the row of its episodes."""
     means: FloatArray

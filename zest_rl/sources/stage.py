@@ -64,7 +64,7 @@ class Stage:
         self._canvas.hide_sky()
 
     def default_pose(self, state: State) -> Pose:
-        """Return the pose of the camera of ``env.render()`` if this state is the first that it shows.
+        """Return the pose of the camera of ``env.render()`` when this state is the first one rendered.
 
         As in Gymnasium's `OffScreenViewer` and `MujocoRenderer`; the camera does not follow what moves.
         """

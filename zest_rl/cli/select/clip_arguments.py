@@ -27,7 +27,8 @@ class ClipArguments:
     """Folder of other clips, which specify the goals, for instance of rendered objects (the paper's sim2real); default
     FOLDER's own clips in turn."""
     ask: Literal["goals", "actions"] = "goals"
-    """goals: is the clip of the goal's object? actions: of any, as all do the same; takes --pool all."""
+    """goals: does the frame reach the goal of the same object? actions: does it show the action, done to any object?
+    The latter takes --pool all."""
     template: str = "Opening [something]"
     """With Something-Something V2: the action."""
     pool: Literal["single", "all"] = "single"
