@@ -7,21 +7,5 @@ Models Perform Zero-Shot Task Specification For Robot Manipulation?", L4DC 2022)
 heavy; import the module of the stage you need.
 """
 
-import importlib
-import sys
-from types import ModuleType
-from typing import Any
-
 __version__ = "0.1.0"
-
-
-class _Kitchen(ModuleType):
-    """``zest_rl.envs``, which the env_spec of every kitchen dataset names; it is `zest_rl.kitchen.env`."""
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return getattr(importlib.import_module("zest_rl.kitchen.env"), name)
-
-
-sys.modules["zest_rl.envs"] = _Kitchen("zest_rl.envs")
+__path__ = [*__path__, f"{__path__[0]}/kitchen/aliases"]  # modules that datasets on disk name by an earlier name

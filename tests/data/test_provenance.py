@@ -70,10 +70,17 @@ def test_a_run_s_description_and_a_dataset_s_metadata_are_read_alike() -> None:
     record = DatasetRecord.from_metadata("zest/x-v0", metadata)
     assert (record.task, record.env["id"], record.fps) == ("micro", "zest/Kitchen-v1", 10)
     assert record.collect == CollectRecord({"task": "micro"}, {"n_failed": 1})
-    assert DatasetRecord.from_description({"id": "zest/x-v0", "sha256": "6" * 64, **metadata}) == record
+    assert DatasetRecord.of_run({"dataset": {"id": "zest/x-v0", "sha256": "6" * 64, **metadata}}) == record
 
 
 @pytest.mark.parametrize("relabel", [{"a": 1}, {**KITCHEN, "scorer": {}}, {**KITCHEN, "scorer": 1}, [1], "x"])
 def test_a_record_of_another_program_is_named_with_its_dataset(relabel: Any) -> None:
     with pytest.raises(BadInput, match="the record of how zest/x-v0 was made is not ours"):
         DatasetRecord.from_metadata("zest/x-v0", {"zest": {"relabel": relabel}})
+
+
+def test_a_run_that_names_no_dataset_is_refused_and_an_empty_record_is_none() -> None:
+    with pytest.raises(BadInput, match="does not say which dataset it was trained on; train it by `zest train`"):
+        DatasetRecord.of_run({"agent": "bc"})
+    record = DatasetRecord.of_run({"dataset": {"zest": {"relabel": {}, "collect": {}}}})
+    assert (record.relabel, record.collect, record.is_foreign) == (None, None, False)

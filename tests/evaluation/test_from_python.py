@@ -11,8 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from zest_rl.agents.dt import DTConfig
 from zest_rl.evaluation.evaluate import EvaluationConfig, evaluation_folder, read_evaluation
 from zest_rl.runtime import artifacts
+from zest_rl.training.loop import TrainingConfig
+from zest_rl.training.runs import train
 
 SCRIPT = """
 import sys
@@ -56,3 +59,12 @@ def test_a_run_from_python_alone_has_the_weights_and_the_online_scores_of_the_co
     assert one.episodes[0].zest_return is not None
     for name, array in one.traces.items():
         np.testing.assert_array_equal(array, other.traces[name], err_msg=name)
+
+
+def test_a_finished_run_whose_scorer_is_gone_gets_it_back(trained: Path) -> None:
+    run = trained / "dt-0"
+    scorer, meta = (run / "zest_scorer.safetensors").read_bytes(), artifacts.read_json(run / "run.json")
+    (run / "zest_scorer.safetensors").unlink()
+    config = TrainingConfig(n_updates=30, device="cpu", threads=1, log_every=10)
+    train("dt", meta["dataset"]["id"], DTConfig(**meta["config"]), config, run_dir=run)
+    assert (run / "zest_scorer.safetensors").read_bytes() == scorer

@@ -238,3 +238,15 @@ def test_mujoco_versions_that_run_the_kitchen_are_accepted(version):
 def test_other_mujoco_versions_are_refused_with_what_to_install(version):
     with pytest.raises(ZestError, match=rf"found mujoco {version}; run: pip install 'mujoco>=3.3.7,<3.12'"):
         check_mujoco(version)
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import zest_rl.envs; print(zest_rl.envs.KitchenEnv.__module__); gymnasium.spec('zest/Kitchen-v1')",
+        "gymnasium.make('zest_rl.envs:zest/Kitchen-v1', task='micro'); print('zest_rl.kitchen.env')",
+    ],
+)
+def test_the_module_that_datasets_name_registers_the_environment(code: str) -> None:
+    done = subprocess.run([sys.executable, "-c", f"import gymnasium; {code}"], capture_output=True, text=True)
+    assert done.stdout.strip() == "zest_rl.kitchen.env", done.stderr

@@ -22,7 +22,7 @@ from read_dataset import read
 from zest_rl.cli import main
 from zest_rl.data import reader
 from zest_rl.data.reader import Dataset
-from zest_rl.errors import BadInput
+from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen.views import Views
 from zest_rl.rewards.relabel import (
     GOAL_FOLDER,
@@ -217,6 +217,17 @@ def test_a_null_control_and_a_choice_of_goals_are_datasets_of_their_own(relabele
     again = relabel_kitchen(replace(CONFIG, goal=str(DRAWINGS), goal_share=0.4), n_workers=1)
     assert again.already_there
     np.testing.assert_array_equal(again.scorer.goals, chosen.scorer.goals)
+
+
+def test_a_source_that_changes_while_it_is_relabeled_is_noticed_and_nothing_is_written(
+    collected: str, relabeled: Relabeled
+) -> None:
+    source = kitchen_source(collected, VIEWS)
+    with h5py.File(reader.dataset_path(collected) / reader.DATA_FILE, "r+") as file:
+        file["episode_0/actions"][0, 0] += 0.25
+    with pytest.raises(ZestError, match=r"main_data.hdf5 of dataset .* was changed since it was read"):
+        relabel_source(source, CONFIG, n_workers=1)
+    assert reader.list_datasets() == [collected]
 
 
 def test_relabeling_again_does_nothing(relabeled: Relabeled) -> None:

@@ -72,7 +72,7 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
     if not launched().leads:
         return {}
     meta = artifacts.read_json(run_dir / "meta.json")
-    evaluable = is_evaluable(DatasetRecord.from_description(meta["dataset"]))
+    evaluable = is_evaluable(DatasetRecord.of_run(meta))
     return {
         "run": str(run_dir),
         **{key: meta[key] for key in ("agent", "n_params", "n_updates", "train_seconds")},

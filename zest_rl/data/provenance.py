@@ -154,8 +154,8 @@ class DatasetRecord:
                 env_spec=metadata.get("env_spec"),
                 ref_min_score=metadata.get("ref_min_score"),
                 ref_max_score=metadata.get("ref_max_score"),
-                collect=collect and CollectRecord(collect.get("asked", {}), collect.get("result", {})),
-                relabel=relabel and RelabelRecord.from_json(relabel),
+                collect=CollectRecord(collect.get("asked", {}), collect.get("result", {})) if collect else None,
+                relabel=RelabelRecord.from_json(relabel) if relabel else None,
                 fps=stages.get("recorded", {}).get("fps"),
             )
         except (KeyError, TypeError, AttributeError) as error:
@@ -165,9 +165,19 @@ class DatasetRecord:
             ) from error
 
     @classmethod
-    def from_description(cls, described: Mapping[str, Any]) -> Self:
-        """Read `zest_rl.data.reader.Dataset.describe`, which a run's ``meta.json`` holds as ``dataset``."""
-        return cls.from_metadata(described["id"], described)
+    def of_run(cls, meta: Mapping[str, Any]) -> Self:
+        """Read a run's ``meta.json``, which holds `zest_rl.data.reader.Dataset.describe` of its dataset.
+
+        Raises:
+            BadInput: it says nothing of a dataset, or a record in it is not in our format.
+        """
+        described = meta.get("dataset")
+        if not isinstance(described, Mapping):
+            raise BadInput(
+                "the run does not say which dataset it was trained on; train it by `zest train`, or from Python by "
+                "zest_rl.training.runs.train"
+            )
+        return cls.from_metadata(str(described.get("id", "(unnamed)")), described)
 
     @property
     def env(self) -> dict[str, Any]:

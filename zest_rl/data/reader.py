@@ -100,6 +100,13 @@ class Dataset:
         """The HDF5 file."""
         return self.path / DATA_FILE
 
+    def file_sha256(self) -> dict[str, str]:
+        """Return the sha256 of the HDF5 file and of the metadata, by name: from the manifest, which was checked."""
+        manifest = self.path / MANIFEST_FILE
+        known: dict[str, str] = artifacts.read_json(manifest) if manifest.exists() else {}
+        names = (DATA_FILE, METADATA_FILE)
+        return {name: known.get(name) or artifacts.hash_file(self.path / name) for name in names}
+
     def episodes(self, *, discrete: bool = False) -> list[Episode]:
         """Read what a trainer may see of every episode; a Dict of observations is flattened (`observations.numbers`).
 
@@ -228,7 +235,7 @@ class Dataset:
         """Identity, environment, scale and provenance, JSON-ready, for the ``meta.json`` of a policy trained on it.
 
         Command, versions and machine are left out, so that an equal dataset made again has an equal description.
-        `DatasetRecord.from_description` reads it.
+        `DatasetRecord.of_run` reads it.
 
         Raises:
             BadInput: a policy could not be evaluated on the dataset, or as in `episodes`.

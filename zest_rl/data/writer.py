@@ -255,11 +255,13 @@ class DatasetCopy:
     """T of every episode."""
     sha256: str
     rewards: Sequence[FloatArray | None]
+    file_sha256: Mapping[str, str]
+    """Of the files that are copied, by name."""
 
     @classmethod
     def of(cls, ds: Dataset) -> Self:
         """Read the fields from an open dataset."""
-        return cls(ds.id, ds.path, ds.n_steps(), ds.fingerprint(), ds.rewards_to_keep())
+        return cls(ds.id, ds.path, ds.n_steps(), ds.fingerprint(), ds.rewards_to_keep(), ds.file_sha256())
 
     @property
     def n_bytes(self) -> int:
@@ -275,10 +277,16 @@ class DatasetCopy:
         return self.rewards
 
     def fill(self, folder: Path) -> None:
-        """Copy the two files."""
+        """Copy the two files.
+
+        Raises:
+            ZestError: a file was changed since it was read.
+        """
         (folder / "data").mkdir()
-        for name in (DATA_FILE, METADATA_FILE):
+        for name, sha256 in self.file_sha256.items():
             shutil.copyfile(self.path / name, folder / name)
+            if artifacts.hash_file(folder / name) != sha256:
+                raise ZestError(f"{name} of dataset {self.dataset_id} was changed since it was read")
 
     def written(self) -> Iterator[Mapping[str, NDArray[Any]]]:
         """Nothing: a copy of a file that fails raises."""

@@ -159,7 +159,7 @@ def evaluate(
     check_finished(run)
     run = run.resolve()
     policy = load_policy(run, device=device)
-    dataset = DatasetRecord.from_description(policy.meta["dataset"])
+    dataset = DatasetRecord.of_run(policy.meta)
     if not is_evaluable(dataset):
         raise BadInput(
             f"`zest evaluate` runs {ENV_ID} alone, and {run.name} was trained on {dataset.id}; act with it from Python "

@@ -94,7 +94,7 @@ def run_episodes(
 
 
 def _record(policy: Policy) -> DatasetRecord:
-    return DatasetRecord.from_description(policy.meta["dataset"])
+    return DatasetRecord.of_run(policy.meta)
 
 
 def _kitchen_spec(env_spec: str) -> gymnasium.envs.registration.EnvSpec:

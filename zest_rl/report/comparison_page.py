@@ -147,7 +147,7 @@ def compare_runs(runs: Sequence[Path], *, title: str) -> Report:
     goals: dict[str, str] = {}
     sources: set[str] = set()
     for run in runs:
-        dataset = DatasetRecord.from_description(read_meta(run)["dataset"])
+        dataset = DatasetRecord.of_run(read_meta(run))
         sources.add(dataset.id if dataset.relabel is None else dataset.relabel.source)
         if dataset.relabel is not None and exists(dataset.id):
             goal = goal_name(dataset.relabel)
@@ -184,7 +184,7 @@ def compare(
         BadInput: a run was not evaluated, or is of another task than the others.
     """
     metas = {str(run): read_meta(run) for method in methods for run in method.runs}
-    tasks = {DatasetRecord.from_description(meta["dataset"]).env["kwargs"]["task"] for meta in metas.values()}
+    tasks = {DatasetRecord.of_run(meta).env["kwargs"]["task"] for meta in metas.values()}
     if len(tasks) != 1:
         raise BadInput(f"a report compares runs of one task, got {', '.join(sorted(tasks))}; write one report per task")
     evaluations = {method.name: method.evaluations() for method in methods}

@@ -87,7 +87,7 @@ def goal_name(relabel: RelabelRecord) -> str:
 def _short_name(meta: dict[str, Any]) -> str:
     if meta["agent"] == FOREIGN:
         return str(meta["name"])
-    agent, relabel = str(meta["agent"]).upper(), DatasetRecord.from_description(meta["dataset"]).relabel
+    agent, relabel = str(meta["agent"]).upper(), DatasetRecord.of_run(meta).relabel
     return agent if agent == "BC" else f"{agent} on {'ground truth' if relabel is None else goal_name(relabel)}"
 
 

@@ -117,15 +117,11 @@ class FrameEmbeddings:
             for i, digest in enumerate(self._digests)
             if not self._path(digest).exists()
         }
-        embedded = cached_jobs(
-            partial(_embed_episode, self._shared),
-            jobs,
-            self._folder,
-            n_workers=self._n_workers,
-            engine=self._engine,
-            device=self._shared.embedder.device,
-        )
-        for n_done, _ in enumerate(embedded, start=len(self._digests) - len(jobs) + 1):
+        work, n_cached = partial(_embed_episode, self._shared), len(self._digests) - len(jobs)
+        options: dict[str, Any] = {
+            "n_workers": self._n_workers, "engine": self._engine, "device": self._shared.embedder.device,
+        }  # fmt: skip
+        for n_done, _ in enumerate(cached_jobs(work, jobs, self._folder, **options), start=n_cached + 1):
             if on_progress is not None:
                 on_progress(n_done, len(self._digests))
         self.n_embedded += len(jobs)

@@ -105,10 +105,8 @@ class StateEmbedder:
         for chunk in chunks(len(missing), STATES_PER_SHARD):
             part = missing[chunk.start : chunk.stop]
             jobs[artifacts.hash_arrays(part)[:20]] = _Job(self.views, self.embedder, part)
-        embedded = cached_jobs(
-            _embed_states, jobs, self.folder, n_workers=self.n_workers, engine=self.engine, device=self.embedder.device
-        )
-        for n_done, _ in enumerate(embedded, start=1):
+        options: dict[str, Any] = {"n_workers": self.n_workers, "engine": self.engine, "device": self.embedder.device}
+        for n_done, _ in enumerate(cached_jobs(_embed_states, jobs, self.folder, **options), start=1):
             if on_progress is not None:
                 on_progress(n_done, len(jobs))
         self.n_embedded += len(missing)

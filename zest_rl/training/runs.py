@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from zest_rl.agents import get_agent
 from zest_rl.data.reader import Dataset, open_dataset
 from zest_rl.rewards.scorer import SCORER_FILE
+from zest_rl.runtime import artifacts
+from zest_rl.training.checkpoints import snapshots
+from zest_rl.training.distributed import launched
 from zest_rl.training.loop import OnProgress, TrainingConfig, fit
 
 
@@ -41,16 +45,14 @@ def train(
     config = TrainingConfig() if config is None else config
     with open_dataset(dataset_id) as dataset:
         episodes, meta, files = dataset.episodes(), {"dataset": dataset.describe()}, scorer_files(dataset)
-    return fit(
-        agent,
-        get_agent(agent).config() if agent_config is None else agent_config,
-        episodes,
-        run_dir or default_run_dir(agent, dataset_id, config.seed),
-        config,
-        meta=meta,
-        files=files,
-        on_progress=on_progress,
-    )
+    run_dir = run_dir or default_run_dir(agent, dataset_id, config.seed)
+    agent_config = get_agent(agent).config() if agent_config is None else agent_config
+    fit(agent, agent_config, episodes, run_dir, config, meta=meta, files=files, on_progress=on_progress)
+    if launched().leads:
+        for folder, (name, content) in product((run_dir, *snapshots(run_dir)), files.items()):
+            if not (folder / name).exists():  # earlier versions wrote it when all else was there
+                artifacts.write_bytes(folder / name, content)
+    return run_dir
 
 
 def default_run_dir(label: str, dataset_id: str, seed: int) -> Path:
