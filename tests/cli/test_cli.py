@@ -126,9 +126,9 @@ def test_the_version_is_the_package_s(capsys: pytest.CaptureFixture[str]) -> Non
         (["toy", "d", "--n-epsodes", "4"], "--n-episodes"),
         (["toy", "d", "--similarity", "dot"], "--similarity must be one of 'cos', 'l2', got 'dot'"),
         (["toy", "d", "e"], "unexpected 'e'"),
-        (["toy", "d", "--noise"], "argument --noise: expected 1 argument"),
+        (["toy", "d", "--noise"], "zest toy: --noise must be a number, got nothing; write it after the flag"),
         (["toy", "d", "--n-episodes", "0"], "error: n-episodes must be at least 1, got 0\n"),
-        (["toy", "d", "--recipe"], "--recipe needs a file"),
+        (["toy", "d", "--recipe"], "zest toy: --recipe needs a file: --recipe FILE.toml"),
     ],
 )
 def test_bad_input_is_one_error_on_stderr_and_exit_code_2(
@@ -303,9 +303,27 @@ def test_flags_mean_what_the_help_says() -> None:
     assert config == Config("d", noise=-2.0, views=(), video=True)
 
 
+def test_a_list_before_a_required_positional_leaves_the_last_word_to_it(tmp_path: Path) -> None:
+    for words in (["--views", "4", "5", "d"], ["--views", "4", "5", "d", "--json"], ["d", "--views", "4", "5"]):
+        assert parse_config(Config, words, "toy")[0] == Config("d", views=(4, 5))
+    recipe = write(tmp_path, 'dataset = "d"')
+    config, _ = parse_config(Config, ["--recipe", str(recipe), "--views", "4", "5"], "toy")
+    assert config == Config("d", views=(4, 5)), "nothing is missing, so the list keeps all"
+    with pytest.raises(BadInput, match="DATASET is required"):
+        parse_config(Config, ["--views", "4", "5", "--noise", "1"], "toy")
+
+
+def test_negative_numbers_are_values_and_all_after_two_hyphens_is_positional() -> None:
+    assert parse_config(Config, ["d", "--noise", "-1e-4"], "toy")[0].noise == -1e-4
+    assert parse_config(Config, ["--views", "4", "--", "-d_s"], "toy")[0] == Config("-d_s", views=(4,))
+    with pytest.raises(BadInput) as caught:
+        parse_config(Config, ["d", "--", "--noise", "3"], "toy")
+    assert str(caught.value) == "zest toy: unexpected '--noise'\n  unexpected '3'"
+
+
 def test_all_problems_of_a_command_line_are_reported_at_once() -> None:
     with pytest.raises(BadInput) as caught:
-        parse_config(Config, ["--n-episodes", "x", "--size", "1", "b", "--nose", "--similarity=dot"], "toy")
+        parse_config(Config, ["--n-episodes", "x", "--size", "1", "b", "--nose=3", "--similarity=dot"], "toy")
     assert str(caught.value).splitlines() == [
         "zest toy: unknown flag '--nose'; did you mean '--noise' or '--size' or '--out'? valid: --n-episodes, "
         "--noise, --out, --similarity, --size, --video, --views",
@@ -313,6 +331,14 @@ def test_all_problems_of_a_command_line_are_reported_at_once() -> None:
         "  --size must be a list [an integer, an integer], got '1 b'",
         "  --similarity must be one of 'cos', 'l2', got 'dot'",
         "  DATASET is required",
+    ]
+    with pytest.raises(BadInput) as caught:
+        parse_config(Config, ["d", "--video=1", "--json=1", "--noise", "--size", "1"], "toy")
+    assert str(caught.value).splitlines() == [
+        "zest toy: --video takes no value, got '1'; write --video alone",
+        "  --json takes no value, got '1'; write --json alone",
+        "  --noise must be a number, got nothing; write it after the flag",
+        "  --size must be a list [an integer, an integer], got '1'",
     ]
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import os
+import sys
 import tomllib
 import types
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,6 @@ from typing import (
     Any,
     Literal,
     NamedTuple,
-    NoReturn,
     TypeVar,
     Union,
     get_args,
@@ -104,26 +103,29 @@ def parse_config(config_class: type[C], argv: Sequence[str], verb: str) -> tuple
             the config refuses a value.
         SystemExit: code 0, after ``--help`` was printed.
     """
-    given, unknown = _split_words(config_class, argv)
+    given, problems, last = _split_words(config_class, argv)
     as_json, asks_for_help, recipe_path = (given.pop(flag, None) for flag in ("--json", "--help", "--recipe"))
     values: dict[str, Any] = {}
-    if recipe_path == "":
-        raise BadInput("--recipe needs a file: --recipe FILE.toml")
     if recipe_path is not None:
-        recipe = read_recipe(Path(recipe_path))
+        if not any(recipe_path):
+            _refuse([*problems, "--recipe needs a file: --recipe FILE.toml"], f"zest {verb}")
+        recipe = read_recipe(Path(recipe_path[0]))
         meant = recipe.pop("verb", verb)
         if meant != verb:
-            raise BadInput(f"recipe {recipe_path} is for `zest {meant}`, not for `zest {verb}`")
-        values, problems = _read_table(config_class, recipe)
-        _refuse(problems, f"recipe {recipe_path}")
-    if asks_for_help:
+            raise BadInput(f"recipe {recipe_path[0]} is for `zest {meant}`, not for `zest {verb}`")
+        values, recipe_problems = _read_table(config_class, recipe)
+        _refuse(recipe_problems, f"recipe {recipe_path[0]}")
+    if asks_for_help is not None:
         _print_help(config_class, verb, values)
-    flags, problems = _read_words(config_class, given)
-    values |= flags
-    required = {field: argument.name for field, argument in _arguments(config_class).items() if argument.is_required}
-    problems += [f"{name} is required" for field, name in required.items() if field not in values | given]
-    _refuse([*unknown, *problems], f"zest {verb}")
-    return config_class(**values), bool(as_json)
+    arguments = _arguments(config_class)
+    missing = [field for field, argument in arguments.items() if argument.is_required and field not in values | given]
+    positional = next((field for field in missing if not arguments[field].is_flag), None)
+    if positional is not None and last in arguments and arguments[last].rule.nargs == "*":
+        given[positional] = [given[last].pop()]  # `--frames a b DATASET`: the list took one word too many
+        missing.remove(positional)
+    flags, wrong = _read_words(config_class, given)
+    _refuse([*problems, *wrong, *(f"{arguments[field].name} is required" for field in missing)], f"zest {verb}")
+    return config_class(**values | flags), as_json is not None
 
 
 class _Argument(NamedTuple):
@@ -139,6 +141,12 @@ class _Argument(NamedTuple):
     def rule(self) -> Any:
         """Tyro's rule for that type: how many words, and what they stand for."""
         return ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(self.kind, set()))
+
+    @property
+    def n_words(self) -> Sequence[int]:
+        """How many words its value may have, in ascending order."""
+        n = self.rule.nargs
+        return range(sys.maxsize) if n == "*" else sorted(n) if isinstance(n, tuple) else [n]
 
     @property
     def is_flag(self) -> bool:
@@ -169,48 +177,86 @@ def _print_help(config_class: type[Any], verb: str, values: Mapping[str, Any]) -
     tyro.cli(with_defaults, args=["--help"], prog=f"zest {verb}", description=description)
 
 
-class _WordSplitter(argparse.ArgumentParser):
-    """Sorts the words of a command line by the arguments that they belong to."""
+class _Words(NamedTuple):
+    """The words of a command line."""
 
-    def error(self, message: str) -> NoReturn:
-        """Raise instead of exiting."""
-        raise BadInput(message)
+    given: dict[str, list[str]]
+    """By the field, or the common flag, that they are values of."""
+    problems: list[str]
+    """What is wrong with those that are of none."""
+    last: str
+    """What the last value was taken for; empty if it stands by itself."""
 
 
-def _split_words(config_class: type[Any], argv: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-    """Return the words that a command line gives for each field and common flag, and what those are that fit none."""
-    splitter = _WordSplitter(add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
-    splitter.add_argument("--recipe", dest="--recipe", nargs="?", const="")
-    splitter.add_argument("--json", dest="--json", action="store_true")
-    splitter.add_argument("-h", "--help", dest="--help", action="store_true")
+def _split_words(config_class: type[Any], argv: Sequence[str]) -> _Words:
+    """Sort the words of a command line by the arguments that they belong to; after ``--``, all are positional."""
     arguments = _arguments(config_class)
+    flags: dict[str, tuple[str, int, list[str]]] = {  # what is given, by how many words at most, and which if by none
+        "--recipe": ("--recipe", 1, []),
+        "--json": ("--json", 0, []),
+        "--help": ("--help", 0, []),
+        "-h": ("--help", 0, []),
+    }
     for field, argument in arguments.items():
-        n_words = argument.rule.nargs
-        if not argument.is_flag:
-            splitter.add_argument(field, nargs="*" if n_words == "*" else "?")
-        elif argument.kind is bool:
-            splitter.add_argument(argument.name, dest=field, action=argparse.BooleanOptionalAction)
-        else:
-            splitter.add_argument(argument.name, dest=field, nargs=n_words)
-    given, unknown = splitter.parse_known_intermixed_args([_with_hyphens(word) for word in argv])
-    flags = [argument.name for argument in arguments.values() if argument.is_flag]
-    return vars(given), [
-        f"unknown flag {word!r}; {nearest(word, flags)}" if word.startswith("--") else f"unexpected {word!r}"
-        for word in unknown
-    ]
+        if argument.is_flag and argument.kind is bool:
+            flags[argument.name] = field, 0, ["True"]
+            flags[f"--no-{_hyphenated(field)}"] = field, 0, ["False"]
+        elif argument.is_flag:
+            flags[argument.name] = field, argument.n_words[-1], []
+    given: dict[str, list[str]] = {}
+    problems: list[str] = []
+    positional: list[str] = []
+    key, room, last = "", 0, ""
+    for i, word in enumerate(argv):
+        if word == "--":
+            positional += argv[i + 1 :]
+            break
+        if not _is_flag(word):
+            last = key if room else ""
+            (given[key] if room else positional).append(word)
+            room = max(room - 1, 0)
+            continue
+        name, equals, value = word.partition("=")
+        name, room = _hyphenated(name), 0
+        if name not in flags:
+            names = [argument.name for argument in arguments.values() if argument.is_flag]
+            problems.append(f"unknown flag {name!r}; {nearest(name, names)}")
+            continue
+        key, room, words = flags[name]
+        given[key] = [*words]
+        if equals and not room:
+            problems.append(f"{name} takes no value, got {value!r}; write {name} alone")
+        elif equals:
+            given[key], room = [value], 0
+    for field, argument in arguments.items():
+        if positional and not argument.is_flag:
+            n_words = argument.n_words[-1]
+            given[field], positional = positional[:n_words], positional[n_words:]
+    return _Words(given, [*problems, *(f"unexpected {word!r}" for word in positional)], last)
 
 
-def _read_words(config_class: type[Any], given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+def _is_flag(word: str) -> bool:
+    """Whether a word names a flag: it starts with a hyphen, and is no negative number and no sentence."""
+    try:
+        float(word)
+    except ValueError:
+        return word.startswith("-") and word != "-" and " " not in word.partition("=")[0]
+    return False
+
+
+def _read_words(config_class: type[Any], given: Mapping[str, Sequence[str]]) -> tuple[dict[str, Any], list[str]]:
     """Return the values that the words of `_split_words` stand for, as the help says, and what is wrong with them."""
     values: dict[str, Any] = {}
     problems: list[str] = []
     for field, words in given.items():
         argument = _arguments(config_class)[field]
-        texts = words if isinstance(words, list) else [str(words)]
         try:
-            values[field] = argument.rule.instance_from_str(texts)
+            if len(words) not in argument.n_words:
+                raise ValueError
+            values[field] = argument.rule.instance_from_str([*words])
         except ValueError:
-            problems.append(f"{argument.name} must be {_describe(argument.kind)}, got {' '.join(texts)!r}")
+            got = repr(" ".join(words)) if words else "nothing; write it after the flag"
+            problems.append(f"{argument.name} must be {_describe(argument.kind)}, got {got}")
     return values, problems
 
 
@@ -284,9 +330,3 @@ def _describe(kind: Any) -> str:
 
 def _hyphenated(name: str) -> str:
     return name.replace("_", "-")
-
-
-def _with_hyphens(word: str) -> str:
-    """Spell ``--n_episodes`` as ``--n-episodes``."""
-    flag, equals, value = word.partition("=")
-    return _hyphenated(flag) + equals + value if word.startswith("--") else word
