@@ -25,6 +25,7 @@ from rollouts import (
     write_rollouts,
 )
 
+from zest_rl import cli
 from zest_rl.data import reader
 from zest_rl.data.reader import Dataset
 from zest_rl.sources.pictures import Pictures
@@ -67,6 +68,15 @@ def test_the_only_camera_is_found_by_itself_also_as_jpeg_in_a_flat_observation(
     check_kept_but_the_rewards(flat, result["dataset"])
     for episode, scores in zip(minari.load_dataset(flat), read(result["dataset"], Dataset.scores), strict=True):
         np.testing.assert_allclose(scores, expected_scores([list(episode.observations)], goal), atol=1e-4)
+
+
+def test_which_frames_were_chosen_is_told_before_they_are_embedded(
+    maze: list[Episode], goal: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flat = write_rollouts("maze/flat-v0", maze, lambda e: np.stack(e.frames))
+    assert cli.main(["relabel", flat, "--goal", str(goal), "--n-workers", "1"]) == 0
+    err = capsys.readouterr().err
+    assert 0 <= err.find("frames: observations\n") < err.index("embedding frames: 100/100")
 
 
 def test_rewards_need_not_be_recorded(pictured: str, goal: Path, zest: Run, tmp_path: Path) -> None:

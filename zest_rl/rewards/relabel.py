@@ -129,6 +129,7 @@ def relabel_source(
     device: str = "auto",
     n_workers: int | None = None,
     engine: Engine = "local",
+    on_start: Callable[[Source], None] | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Relabeled:
     """Write a copy of a dataset whose rewards are ZeST scores.
@@ -144,12 +145,15 @@ def relabel_source(
         device: of the embedder.
         n_workers: processes that read or render, and embed; default one per core.
         engine: processes of this machine, or workers of a Ray cluster; the rewards are the same.
+        on_start: called with `source` before any work, to tell which frames were chosen.
         on_progress: called with (parts embedded, parts in all).
 
     Raises:
         BadInput: the goal, the embedder or the frames do not fit.
         ZestError: the disk is full or read-only; nothing is left behind but finished embeddings.
     """
+    if on_start is not None:
+        on_start(source)
     trajectories = source.trajectories
     scorer, embeddings = _open(source, config, device, n_workers, engine)
     source_sha256 = trajectories.fingerprint()

@@ -9,6 +9,7 @@ from zest_rl.cli.ui import Ui, progress_in_parts
 
 if TYPE_CHECKING:
     from zest_rl.data.reader import Dataset
+    from zest_rl.sources import Source
 
 __all__ = ["Config", "run"]
 
@@ -21,14 +22,19 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
     from zest_rl.data.reader import open_dataset
     from zest_rl.rewards.relabel import relabel
+    from zest_rl.sources import KitchenStates
+
+    def tell(source: Source) -> None:
+        if not isinstance(source.frames, KitchenStates):
+            ui.say(f"frames: {', '.join(source.frames.views)}")
+        if source.frames.describe().get("qpos_is_noisy"):
+            ui.warn("states are read from observations that the environment blurred: what is shown trembles a little")
 
     started = time.monotonic()
     with progress_in_parts(ui, "embedding frames") as on_progress:
-        relabeled = relabel(**vars(config), on_progress=on_progress)
+        relabeled = relabel(**vars(config), on_start=tell, on_progress=on_progress)
     if relabeled.already_there:
         ui.say(f"{relabeled.dataset_id} is there already, nothing to do")
-    if relabeled.source.frames.describe().get("qpos_is_noisy"):
-        ui.warn("states are read from observations that the environment blurred: what is shown trembles a little")
     with open_dataset(relabeled.dataset_id) as ds:
         returns = np.array([rewards.sum() for rewards in ds.rewards()])
         command = _next_command(ds)
