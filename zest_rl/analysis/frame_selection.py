@@ -175,8 +175,6 @@ class FrameSelection:
     """(M,) Ground truth."""
     trajectory: NDArray[np.intp]
     """(M,) trajectory that each candidate is of."""
-    starts_are_alike: bool
-    """Whether all trajectories start with the same picture, so that their contexts are equal."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the measures of `zest_rl.metrics.selection` with 95 % intervals over trajectories, and the counts."""
@@ -222,6 +220,7 @@ def select_frames(
     seed: int = 0,
     precision: Precision = "auto",
     n_workers: int | None = None,
+    on_alike_starts: Callable[[], None] | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> FrameSelection:
     """Draw frames of kitchen datasets and score them by a goal: do the highest scores satisfy it?
@@ -245,6 +244,7 @@ def select_frames(
         seed: of the candidates.
         precision: of the embedder.
         n_workers: processes that embed, default one per core.
+        on_alike_starts: called before scoring if ``different`` changes nothing: all trajectories start alike.
         on_progress: called with (parts embedded, parts in all).
 
     Raises:
@@ -261,6 +261,8 @@ def select_frames(
             f"highest {top} could not all; give more --n-frames, a smaller --top, or a dataset with more successes"
         )
     cameras = Views(goal_task.name, views, robot=show_robot, tolerance=tolerance)
+    if on_alike_starts is not None and context == "different" and pool.start_alike(cameras):
+        on_alike_starts()
     config = ScorerConfig(goal, embedder, features, similarity, precision)
     scores = score_pool(
         pool,
@@ -273,4 +275,4 @@ def select_frames(
         n_workers=n_workers,
         on_progress=on_progress,
     )
-    return FrameSelection(goal_task.name, top, scores, satisfies, pool.trajectory, pool.start_alike(cameras))
+    return FrameSelection(goal_task.name, top, scores, satisfies, pool.trajectory)

@@ -14,10 +14,11 @@ def run(config: GoalArguments | ActionArguments, ui: Ui) -> dict[str, Any]:
     """Draw candidates, score them, judge the highest scores."""
     from zest_rl.analysis.frame_selection import select_frames
 
-    with progress_in_parts(ui, "rendering and embedding") as on_progress:
-        selected = select_frames(ask=config.what, **vars(config), on_progress=on_progress)
-    if selected.starts_are_alike and getattr(config, "context", "same") == "different":
+    def warn() -> None:
         ui.warn("all trajectories start with the same picture, so x_0 of another one changes nothing; try --show-robot")
+
+    with progress_in_parts(ui, "rendering and embedding") as on_progress:
+        selected = select_frames(ask=config.what, **vars(config), on_alike_starts=warn, on_progress=on_progress)
     return {
         "select": config.what,
         "task": selected.task,
