@@ -274,7 +274,9 @@ def test_an_object_with_few_clips_is_left_out_and_named(root: Path, capsys: pyte
     assert "drawer" not in out
     (root / VIDEOS / "1000.webm").unlink()
     assert cli.main(words) == 2
-    assert "no object has 2 clips in" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "no object has 2 clips in" in err
+    assert "left out: 'oven', 'drawer'" in err
 
 
 @pytest.mark.parametrize(

@@ -181,9 +181,12 @@ def select_clips(
     goal_clips = clips if within else find_clips(goal_folder, template)
     goal_things = {clip.thing for clip in goal_clips}
     things = [thing for thing in things_with(clips, 3 if within else 2) if thing in goal_things]
-    if not things:
-        raise BadInput(f"no object has 2 clips in {folder} to choose from and 1 other in {goal_folder} for the goal")
     left_out = dict.fromkeys(clip.thing for clip in (*clips, *goal_clips) if clip.thing not in things)
+    if not things:
+        raise BadInput(
+            f"no object has 2 clips in {folder} to choose from and 1 other in {goal_folder} for the goal; "
+            f"left out: {', '.join(map(repr, left_out))}"
+        )
     clips = _first_of_each(clips, things, max_clips)
     goal_clips = clips if within else _first_of_each(goal_clips, things, max_clips)
     network = load_embedder(embedder, device=device, precision=precision)
