@@ -122,7 +122,7 @@ def test_the_library_does_what_the_command_does(
     assert (made.dataset_id, made.path, made.already_there) == (DATASET, tmp_path / "minari" / DATASET, False)
     assert made.result == {key: result[key] for key in made.result}
     assert parts_done == [(n, 6) for n in range(1, 7)]
-    assert [sentence.split(":")[0] for sentence in sentences] == ["expert"]
+    assert [sentence.split(":")[0] for sentence in sentences] == ["expert", f"writing {made.path}"]
     described = read(DATASET, Dataset.describe)
     again = collect_dataset(config)
     assert (again.already_there, again.result) == (True, made.result)

@@ -50,7 +50,7 @@ def collect_dataset(
         config: of the dataset.
         n_workers: processes, default one per core.
         on_progress: called with (episodes done, episodes in all), of the references and of the dataset.
-        on_result: called with a sentence about each result on the way: references, and each try of a calibration.
+        on_result: called with a sentence about references, each try of a calibration, and where the dataset is written.
 
     Raises:
         BadInput: a dataset of this id was collected with other arguments.
@@ -85,6 +85,7 @@ def collect_dataset(
     episodes = run_behaviour(behaviour, config.n_episodes, n_workers=n_workers, on_progress=count)
     flaws = {name: getattr(behaviour, name) for name in LARGEST}
     result = _result(episodes, flaws, references)
+    on_result(f"writing {path}")
     write_dataset(
         config.dataset_id,
         recordings(episodes),
