@@ -7,7 +7,8 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,11 @@ from torch import Tensor, nn
 from zest_rl.agents import get_agent, load_policy
 from zest_rl.agents.base import DataFacts, autocast
 from zest_rl.agents.foreign import identify
+from zest_rl.cli import evaluate as evaluate_verb
+from zest_rl.cli.ui import SilentUi
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.evaluation.evaluate import EPISODES_PER_JOB, Evaluation, EvaluationConfig, evaluate
+from zest_rl.kitchen import videos
 from zest_rl.runtime import artifacts
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit:FutureWarning")  # d3rlpy writes TorchScript
@@ -56,6 +60,15 @@ class TowardsZero(nn.Module):
 
     def forward(self, obs: Tensor) -> Tensor:
         return -2 * obs[:, :9]
+
+
+class Constant(nn.Module):
+    def __init__(self, value: float) -> None:
+        super().__init__()
+        self.value = value
+
+    def forward(self, obs: Tensor) -> Tensor:
+        return torch.full_like(obs[:, :9], self.value)
 
 
 def save(module: nn.Module, path: Path) -> str:
@@ -110,20 +123,34 @@ def test_the_documented_server_acts_as_the_same_policy_in_torchscript_to_the_bit
 def test_actions_beyond_the_bounds_are_clipped_and_counted(
     adopt: Callable[..., Path], zest: Verb, tmp_path: Path
 ) -> None:
-    class Constant(nn.Module):
-        def __init__(self, value: float) -> None:
-            super().__init__()
-            self.value = value
-
-        def forward(self, obs: Tensor) -> Tensor:
-            return torch.full_like(obs[:, :9], self.value)
-
     far, edge = (adopt(save(Constant(value), tmp_path / f"{value}.pt")) for value in (7.0, 1.0))
     results = [evaluate(run, TWO, n_workers=1) for run in (far, edge)]
     assert_same_episodes(*results)
     assert [list(result.traces["clipped"]) for result in results] == [[SHORT_HORIZON] * 2, [0, 0]]
     words = ("--n-episodes", 2, "--seed", 11, "--n-workers", 1, "--no-videos")
     assert [zest("evaluate", run, *words)["clipped_actions"] for run in (far, edge)] == [1.0, 0.0]
+
+
+def test_what_was_clipped_is_told_and_timed_before_videos_are_written(
+    adopt: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+
+    class Listener(SilentUi):
+        def warn(self, text: str) -> None:
+            told.append(text)
+
+    def slow_videos(videos_to_write: Iterable[videos.Video], n_workers: int | None) -> None:
+        told.append(f"{len(list(videos_to_write))} videos")
+        time.sleep(1)
+
+    monkeypatch.setattr(videos, "ensure_videos", slow_videos)
+    run = adopt(save(Constant(7.0), tmp_path / "far.pt"))
+    evaluate(run, TWO, n_workers=1)
+    started = time.monotonic()
+    result = evaluate_verb.run(evaluate_verb.Config(run, n_episodes=2, seed=11, n_workers=1), Listener())
+    assert result["seconds"] <= time.monotonic() - started - 1 + 0.01, "rounded"
+    assert told == ["100.0% of the actions left [-1, 1] and were clipped, as the environment does", "3 videos"]
 
 
 def test_a_torchscript_module_with_a_memory_is_told_that_episodes_begin(

@@ -43,28 +43,25 @@ class Config:
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Roll out, summarise, write videos."""
     from zest_rl.evaluation.evaluate import episode_videos, evaluate, evaluation_folder
+    from zest_rl.kitchen.videos import ensure_videos
 
-    started = time.monotonic()
+    started, asked = time.monotonic(), settings(config)
     with ui.progress("episodes", config.n_episodes) as advance:
         result = evaluate(
-            config.run,
-            settings(config),
-            score=config.score,
-            videos=config.videos,
-            device=config.device,
-            n_workers=config.n_workers,
-            on_progress=advance,
+            config.run, asked, score=config.score, device=config.device, n_workers=config.n_workers, on_progress=advance
         )
-    summary, folder = result.summary(), evaluation_folder(config.run, result.config)
+    seconds, summary = round(time.monotonic() - started, 2), result.summary()
     if clipped := summary.get("clipped_actions"):
         ui.warn(f"{clipped:.1%} of the actions left [-1, 1] and were clipped, as the environment does")
-    videos = {name: str(folder / video.path.name) for name, video in episode_videos(result).items()}
+    videos = episode_videos(result) if config.videos else {}
+    folder = evaluation_folder(config.run, asked)
+    ensure_videos(videos.values(), n_workers=config.n_workers)
     return {
         "run": str(config.run),
         **summary,
         "result": str(folder / "result.json"),
-        "videos": videos if config.videos else {},
-        "seconds": round(time.monotonic() - started, 2),
+        "videos": {name: str(folder / video.path.name) for name, video in videos.items()},
+        "seconds": seconds,
         "next": f"zest report {shlex.quote(str(config.run))}",
     }
 
