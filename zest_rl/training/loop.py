@@ -329,5 +329,5 @@ def _write_policy(folder: Path, state: TrainState, described: dict[str, Any], fi
     for name, content in {**files, "model.safetensors": weights}.items():
         artifacts.write_bytes(folder / name, content)
     n_params = sum(p.numel() for p in state.params.values())
-    results = (n_params, artifacts.hash_bytes(weights), round(state.seconds, 1), artifacts.provenance())
+    results = (n_params, artifacts.hash_bytes(weights), round(state.seconds, 3), artifacts.provenance())
     artifacts.write_json(folder / "meta.json", described | dict(zip(RESULT_KEYS, results, strict=True)))
