@@ -196,4 +196,4 @@ def seconds_of(cell: Cell, output: Path) -> dict[str, float]:
     meta = artifacts.read_json(cell.run / "meta.json")
     times = {"train_seconds": meta["train_seconds"]} if "train_seconds" in meta else {}
     times |= read_arrays(output / "done" / f"{cell.name}.npz") or {}
-    return {name: round(float(value), 1) for name, value in times.items()}
+    return {name: round(float(value), 3) for name, value in times.items()}
