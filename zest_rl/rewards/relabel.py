@@ -19,10 +19,11 @@ from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.views import Views
 from zest_rl.rewards.embeddings import EpisodeEmbeddings
 from zest_rl.rewards.frame_embeddings import FrameEmbeddings
-from zest_rl.rewards.goals import read_free_goal, read_kitchen_goal
+from zest_rl.rewards.goals import read_free_goal
 from zest_rl.rewards.scorer import SCORER_FILE, Scorer, ScorerConfig
 from zest_rl.rewards.scores import Features, Similarity
-from zest_rl.rewards.state_embeddings import StateEmbedder, StateEmbeddings
+from zest_rl.rewards.state_embeddings import StateEmbeddings
+from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.parallel import Engine
 from zest_rl.sources import KitchenStates, Source, open_source
@@ -216,9 +217,8 @@ def _open(
     if not isinstance(frames, KitchenStates):
         scorer = Scorer.build(config, read_free_goal(config.goal), device=device)
         return scorer, FrameEmbeddings(source, config.embedder, config.precision, **options)
-    goal = read_kitchen_goal(config.goal, frames.ring, frames.states[0][0])
-    embedder = StateEmbedder(frames.ring, config.embedder, config.precision, **options)
-    return Scorer.build(config, goal, views=frames.ring, device=device), StateEmbeddings(embedder, frames.states)
+    kitchen = StateScorer.build(config, frames.ring, frames.states[0][0], **options)
+    return kitchen.scorer, StateEmbeddings(kitchen.embedder, frames.states)
 
 
 def _write_scorer(folder: Path, scorer: Scorer) -> None:
