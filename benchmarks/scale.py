@@ -105,7 +105,7 @@ def memory_of(processes: list[int]) -> float:
     total = 0
     for process in processes:
         try:
-            lines = Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()
+            lines = Path(f"/proc/{process}/smaps_rollup").read_text(encoding="utf-8").splitlines()
         except OSError:
             continue
         total += sum(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
@@ -160,7 +160,11 @@ def kill_a_worker(dataset_id: str, cache: str, *words: str) -> dict[str, Any]:
         while n_done() < SOME // 4 and process.poll() is None:
             time.sleep(0.1)
         before = n_done()
-        worker = next(p for p in processes_of(process.pid) if "spawn_main" in Path(f"/proc/{p}/cmdline").read_text())
+        worker = next(
+            p
+            for p in processes_of(process.pid)
+            if "spawn_main" in Path(f"/proc/{p}/cmdline").read_text(encoding="utf-8")
+        )
         os.kill(worker, signal.SIGKILL)
         _, err = process.communicate()
     kept, said = n_done(), err.strip().splitlines()[-1]

@@ -67,7 +67,7 @@ def outcome(read: Callable[[], Any]) -> Outcome:
 def _limit() -> None:
     faulthandler.disable()
     signal.signal(signal.SIGXCPU, signal.SIG_DFL)
-    with open("/proc/self/statm") as file:  # noqa: PTH123
+    with open("/proc/self/statm", encoding="utf-8") as file:  # noqa: PTH123
         held = int(file.read().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (held + MEMORY, held + MEMORY))
     used = resource.getrusage(resource.RUSAGE_SELF)

@@ -84,7 +84,9 @@ def test_a_module_imports_only_from_its_own_room_and_those_before_it(name: str) 
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:
-    graph = {name: set(own_imports(ast.parse(path.read_text()))) - {name} for name, path in MODULES.items()}
+    graph = {
+        name: set(own_imports(ast.parse(path.read_text(encoding="utf-8")))) - {name} for name, path in MODULES.items()
+    }
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
@@ -98,21 +100,21 @@ def test_no_file_is_a_drawer_for_odds_and_ends() -> None:
 
 @pytest.mark.parametrize("path", SOURCES, ids=module_name)
 def test_a_file_has_at_most_400_lines(path: Path) -> None:
-    assert len(path.read_text().splitlines()) <= 400, "split it along its jobs"
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 400, "split it along its jobs"
 
 
 @pytest.mark.parametrize("path", sorted((PACKAGE / "cli").rglob("*.py")), ids=module_name)
 def test_a_verb_reads_flags_calls_the_library_and_prints(path: Path) -> None:
     parts = module_name(path).split(".")
     if parts != ["cli", "config"] and parts[1:2] != ["reproduce"]:
-        assert len(path.read_text().splitlines()) <= 80, "what it does belongs into a room below"
+        assert len(path.read_text(encoding="utf-8").splitlines()) <= 80, "what it does belongs into a room below"
 
 
 def test_only_the_env_module_imports_gymnasium_robotics() -> None:
     users = {
         module_name(path)
         for path in SOURCES
-        for name in imported(ast.parse(path.read_text()))
+        for name in imported(ast.parse(path.read_text(encoding="utf-8")))
         if name.split(".")[0] == "gymnasium_robotics"
     }
     assert users == {"kitchen.env"}
@@ -133,23 +135,27 @@ def test_importing_the_package_or_its_command_imports_nothing_heavy(module: str)
 
 
 def test_the_ground_truth_of_a_dataset_is_read_only_where_reports_are_made() -> None:
-    readers = {module_name(path) for path in SOURCES if ".truth()" in path.read_text()}
+    readers = {module_name(path) for path in SOURCES if ".truth()" in path.read_text(encoding="utf-8")}
     assert readers == set(MAY_READ_GROUND_TRUTH)
     for path in SOURCES:
-        if "infos/gt" in path.read_text():
+        if "infos/gt" in path.read_text(encoding="utf-8"):
             assert room(module_name(path)) == "data", "it is read through `Dataset.truth` alone"
 
 
 def test_ground_truth_read_from_states_is_for_judging_alone() -> None:
-    users = {module_name(path) for path in SOURCES if "progress_of" in path.read_text()}
+    users = {module_name(path) for path in SOURCES if "progress_of" in path.read_text(encoding="utf-8")}
     assert users == {"kitchen.env", "analysis.frame_selection"}
-    importers = {module_name(path) for path in SOURCES if "zest_rl.analysis.frame_selection import" in path.read_text()}
+    importers = {
+        module_name(path)
+        for path in SOURCES
+        if "zest_rl.analysis.frame_selection import" in path.read_text(encoding="utf-8")
+    }
     assert importers == {"cli.select.frames"}
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=module_name)
 def test_nothing_is_pickled_or_unpickled(path: Path) -> None:
-    tree = ast.parse(path.read_text())
+    tree = ast.parse(path.read_text(encoding="utf-8"))
     assert not {name.split(".")[0] for name in imported(tree)} & {"pickle", "cloudpickle", "joblib", "dill"}
     for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
         options = {k.arg: k.value.value for k in call.keywords if isinstance(k.value, ast.Constant)}
@@ -158,3 +164,15 @@ def test_nothing_is_pickled_or_unpickled(path: Path) -> None:
         if ast.unparse(call.func) == "torch.load":
             assert options.get("weights_only") is True, "say weights_only=True"
         assert ast.unparse(call.func) != "torch.save", "weights are written as safetensors"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=module_name)
+def test_text_files_are_utf_8_whatever_the_locale(path: Path) -> None:
+    for call in (node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)):
+        name = ast.unparse(call.func)
+        reads = isinstance(call.func, ast.Attribute) and call.func.attr in ("read_text", "write_text")
+        opens = name.endswith(".open") or name == "open"
+        modes = [arg.value for arg in call.args if isinstance(arg, ast.Constant)]
+        in_bytes = any("b" in str(mode) for mode in modes) or name in ("os.open", "Image.open", "webbrowser.open")
+        if reads or (opens and not in_bytes):
+            assert "encoding" in {keyword.arg for keyword in call.keywords}, ast.unparse(call)

@@ -33,7 +33,7 @@ def differing_versions(*names: str) -> list[str]:
 def is_the_same_machine() -> bool:
     """Whether floats must agree to the bit: across CPUs and versions they do to some digits."""
     try:
-        cpu = Path("/proc/cpuinfo").read_text()
+        cpu = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
         return False
     return f": {EXPECTED['made_with']['cpu']}\n" in cpu and not differing_versions()
@@ -116,7 +116,7 @@ def test_a_finished_run_is_found_by_the_command_that_made_it(name: str, before: 
 def test_a_run_acts_and_its_scorer_scores_as_they_did(name: str, before: Path, zest: Zest) -> None:
     run, expected = before / "runs" / name, RUNS[name]
     result = Path(zest("evaluate", run, *expected["evaluate"])["result"])
-    found = json.loads(result.read_text())
+    found = json.loads(result.read_text(encoding="utf-8"))
     assert found["summary"]["target_return"] == expected["target_return"]
     for episode, then in zip(found["episodes"], expected["episodes"], strict=True):
         assert episode["gt_return"] == close(then["gt_return"], 1e-2)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import io
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -103,6 +104,19 @@ def test_the_help_of_every_verb_imports_nothing_heavy(verb: str) -> None:
     done = subprocess.run([sys.executable, "-c", code, verb, *allowed], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert f"usage: zest {verb}" in done.stdout
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+@pytest.mark.parametrize("words", [["--help"], ["relabel", "--help"], ["select"], ["inspect", "zest/цель-v0"]])
+def test_help_and_messages_print_in_every_encoding(words: list[str], encoding: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys; from zest_rl.cli import main; sys.exit(main())", *words],
+        env=os.environ | {"PYTHONIOENCODING": encoding, "LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"},
+        capture_output=True, encoding=encoding,
+    )  # fmt: skip
+    assert done.returncode == (0 if "--help" in words else 2), done.stderr
+    assert "Unicode" not in done.stderr
+    assert done.stdout if "--help" in words else done.stderr.startswith("error: ")
 
 
 def test_every_verb_describes_itself_and_its_arguments(capsys: pytest.CaptureFixture[str]) -> None:
@@ -309,7 +323,7 @@ def test_a_list_before_a_required_positional_leaves_the_last_word_to_it(tmp_path
     recipe = write(tmp_path, 'dataset = "d"')
     config, _ = parse_config(Config, ["--recipe", str(recipe), "--views", "4", "5"], "toy")
     assert config == Config("d", views=(4, 5)), "nothing is missing, so the list keeps all"
-    with pytest.raises(BadInput, match="DATASET is required"):
+    with pytest.raises(BadInput, match="DATASET is required: --views took '4 5'; write DATASET before the flags"):
         parse_config(Config, ["--views", "4", "5", "--noise", "1"], "toy")
 
 

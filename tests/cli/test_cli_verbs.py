@@ -55,7 +55,7 @@ def test_each_verb_ends_with_the_next_command_and_that_command_works(
     assert reported["report"] == "report.html"
     assert reported["rows"].keys() == {"Demo", "BC"}
     assert reported["rows"]["BC"] == round(evaluated["normalized_return"]["value"], 2)
-    assert "BC" in Path("report.html").read_text()
+    assert "BC" in Path("report.html").read_text(encoding="utf-8")
 
 
 def test_a_folder_with_a_space_is_quoted_in_the_next_command(
@@ -196,7 +196,7 @@ def test_a_recipe_of_a_table_is_valid_and_found_from_anywhere(
     monkeypatch.chdir(tmp_path)
     for variable in ("ZEST_VISUAL_TASKS", "ZEST_FOOTAGE", "ZEST_RENDERED"):
         monkeypatch.setenv(variable, str(tmp_path))
-    if "\nstudy = " in path.read_text():
+    if "\nstudy = " in path.read_text(encoding="utf-8"):
         study = read_study(Path("eval") / path.name)
         assert study.tables.title
         assert study.settings
@@ -214,7 +214,7 @@ def test_a_recipe_of_a_table_is_valid_and_found_from_anywhere(
     ids=lambda path: path.name,
 )
 def test_a_recipe_of_a_verb_is_valid(path: Path) -> None:
-    verb = next(line for line in path.read_text().splitlines() if line.startswith("verb")).split('"')[1]
+    verb = next(line for line in path.read_text(encoding="utf-8").splitlines() if line.startswith("verb")).split('"')[1]
     configs: dict[str, Any] = {"collect": collect_verb.Config}
     configs |= {f"train {agent}": config for agent, config in train.CONFIGS.items()}
     configs |= {f"follow {what}": config for what, config in follow.CONFIGS.items()}

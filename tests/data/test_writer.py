@@ -379,7 +379,7 @@ def start_writing(n_episodes: int, seed: int) -> subprocess.Popen[str]:
 def command_line(pid: int) -> str:
     """Of a process; empty when it has ended, also when nobody has taken note of that."""
     try:
-        return Path(f"/proc/{pid}/cmdline").read_text()
+        return Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8")
     except (FileNotFoundError, ProcessLookupError):
         return ""
 

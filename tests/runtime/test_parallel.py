@@ -54,7 +54,7 @@ def wait_for_two(folder: Path) -> Arrays:
 def beat(heart: Path) -> Arrays:
     """Append to a file for a minute."""
     for _ in range(1200):
-        with heart.open("a") as file:
+        with heart.open("a", encoding="utf-8") as file:
             file.write(".")
         time.sleep(0.05)
     return {"values": np.ones(1)}

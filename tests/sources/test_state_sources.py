@@ -273,7 +273,7 @@ def test_targets_that_only_a_renderer_places_are_refused(goal: Path, refusal: Ca
 
 def test_embeddings_of_states_are_cached_by_the_compiled_model(maze: list[Episode], tmp_path: Path) -> None:
     bare: Any = gymnasium.make("HalfCheetah-v5").unwrapped
-    text = Path(bare.fullpath).read_text()
+    text = Path(bare.fullpath).read_text(encoding="utf-8")
     path, digests = tmp_path / "cheetah.xml", []
     cheetah = roll_out("HalfCheetah-v5", (1,))
     dataset = write_states("cheetah/random-v0", "HalfCheetah-v5", cheetah)

@@ -22,6 +22,7 @@ from typing import Any
 from zest_rl import __version__
 from zest_rl.cli.config import parse_config
 from zest_rl.cli.output import print_failure, print_result
+from zest_rl.cli.streams import print_in_any_encoding
 from zest_rl.cli.terminal import StreamUi
 from zest_rl.cli.verbs import HELP, VERBS, sub_verb_help
 from zest_rl.errors import BadInput, nearest
@@ -31,6 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run ``zest`` with `argv` (default: the process's own arguments) and return its exit code."""
     # NumPy's threads beside busy workers make small products many times slower; it reads this when it is loaded
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    print_in_any_encoding()
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         return _dispatch(words)

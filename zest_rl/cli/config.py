@@ -124,7 +124,8 @@ def parse_config(config_class: type[C], argv: Sequence[str], verb: str) -> tuple
         given[positional] = [given[last].pop()]  # `--frames a b DATASET`: the list took one word too many
         missing.remove(positional)
     flags, wrong = _read_words(config_class, given)
-    _refuse([*problems, *wrong, *(f"{arguments[field].name} is required" for field in missing)], f"zest {verb}")
+    wrong += [f"{arguments[field].name} is required{_taker(arguments[field], arguments, given)}" for field in missing]
+    _refuse([*problems, *wrong], f"zest {verb}")
     return config_class(**values | flags), as_json is not None
 
 
@@ -233,6 +234,18 @@ def _split_words(config_class: type[Any], argv: Sequence[str]) -> _Words:
             n_words = argument.n_words[-1]
             given[field], positional = positional[:n_words], positional[n_words:]
     return _Words(given, [*problems, *(f"unexpected {word!r}" for word in positional)], last)
+
+
+def _taker(missing: _Argument, arguments: Mapping[str, _Argument], given: Mapping[str, Sequence[str]]) -> str:
+    """Name the flags whose lists may have taken the word of a missing positional argument."""
+    lists = [
+        f"{arguments[field].name} took {' '.join(given[field])!r}"
+        for field in given
+        if field in arguments and arguments[field].is_flag and arguments[field].rule.nargs == "*" and given[field]
+    ]
+    if missing.is_flag or not lists:
+        return ""
+    return f": {', '.join(lists)}; write {missing.name} before the flags"
 
 
 def _is_flag(word: str) -> bool:

@@ -89,7 +89,9 @@ def _declared_bounds(entry: h5py.Dataset) -> tuple[float, float]:
 
 @functools.lru_cache(maxsize=4)
 def _observation_space(metadata: Path, changed: int) -> Any:
-    return json.loads(json.loads(metadata.read_text())["observation_space"])  # large: it has bounds for each pixel
+    return json.loads(
+        json.loads(metadata.read_text(encoding="utf-8"))["observation_space"]
+    )  # large: it has bounds for each pixel
 
 
 def _is_jpeg(entry: h5py.Dataset) -> bool:

@@ -197,7 +197,7 @@ def computes_bf16(device: str) -> bool:
     if device.startswith("cuda") or (device == "auto" and Path("/proc/driver/nvidia/gpus").is_dir()):
         return True
     cpu = Path("/proc/cpuinfo")
-    flags = set(re.findall(r"\w+", cpu.read_text())) if cpu.is_file() else set()
+    flags = set(re.findall(r"\w+", cpu.read_text(encoding="utf-8"))) if cpu.is_file() else set()
     return device != "mps" and bool(flags & {"avx512_bf16", "amx_bf16", "bf16"})
 
 

@@ -63,7 +63,7 @@ def _write_level(folder: Path, arrays: dict[str, NDArray[Any]], children: dict[s
         meta[name] = {"device": "cpu", "shape": list(values.shape), "dtype": dtype, "is_nested": False}
     n_transitions = len(arrays["observation"])
     meta |= {"shape": [n_transitions], "device": "None", "_type": TYPE}
-    (folder / "meta.json").write_text(json.dumps(meta))
+    (folder / "meta.json").write_text(json.dumps(meta), encoding="utf-8")
 
 
 def to_torchrl(dataset_id: str, *, shape: Shape = "step", normalise: bool = False) -> TensorDict:

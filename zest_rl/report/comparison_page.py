@@ -111,7 +111,7 @@ def learning_curve(method: Method) -> Curve | None:
     if not all((run / "metrics.csv").exists() for run in method.runs):
         return None  # a snapshot has no log
     for run in method.runs:
-        with (run / "metrics.csv").open(newline="") as file:
+        with (run / "metrics.csv").open(newline="", encoding="utf-8") as file:
             columns.append([(float(row["update"]), float(row["loss"])) for row in csv.DictReader(file)])
     length = min(map(len, columns))
     if length < 2:

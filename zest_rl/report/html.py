@@ -55,7 +55,9 @@ def render_html(report: Report) -> str:
         "sha256": _sha256,
     }
     environment.tests["finite"] = lambda value: value is not None and math.isfinite(value)
-    style, script = (Markup((files("zest_rl.report") / name).read_text("utf-8")) for name in ("style.css", "script.js"))
+    style, script = (
+        Markup((files("zest_rl.report") / name).read_text(encoding="utf-8")) for name in ("style.css", "script.js")
+    )
     return environment.get_template("page.html").render(
         title=report.title,
         summary=report.summary,

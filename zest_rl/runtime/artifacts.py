@@ -118,7 +118,7 @@ def read_json(path: Path) -> Any:
         ZestError: the file does not exist or is not JSON.
     """
     try:
-        return json.loads(path.read_text())
+        return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ZestError(f"{path} does not exist; was the stage before this one run to its end?") from error
     except (OSError, ValueError) as error:

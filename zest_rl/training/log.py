@@ -23,13 +23,13 @@ class MetricsLog:
     def __init__(self, run_dir: Path, n_done: int) -> None:
         """Open the log, and drop the rows that a killed run logged after update `n_done`."""
         path, header = run_dir / "metrics.csv", ",".join(("update", *COLUMNS))
-        lines = path.read_text().splitlines() if path.exists() and n_done else []
+        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() and n_done else []
         kept = [line for line in lines[1:] if line.count(",") == len(COLUMNS) and int(line.partition(",")[0]) <= n_done]
         artifacts.write_bytes(path, "".join(f"{line}\n" for line in (header, *kept)).encode())
         if not n_done:
             shutil.rmtree(run_dir / "tb", ignore_errors=True)
         self._board = SummaryWriter(run_dir / "tb", purge_step=n_done + 1)
-        self._file = path.open("a", newline="")
+        self._file = path.open("a", newline="", encoding="utf-8")
         self._rows = csv.writer(self._file, lineterminator="\n")
 
     def write(self, update: int, row: Mapping[str, float]) -> None:

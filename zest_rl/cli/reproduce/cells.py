@@ -182,7 +182,7 @@ def _followed(runs: Collection[Path], advance: Callable[[int], object]) -> Itera
 
 def _updates_done(run: Path) -> int:
     try:
-        rows = (run / "metrics.csv").read_text().splitlines()
+        rows = (run / "metrics.csv").read_text(encoding="utf-8").splitlines()
         return int(rows[-1].split(",")[rows[0].split(",").index("update")])
     except (OSError, IndexError, ValueError):
         return 0
