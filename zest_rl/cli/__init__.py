@@ -43,13 +43,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(words: list[str]) -> int:
-    if not words:
-        print(HELP, file=sys.stderr)
-        return 2
-    first, *rest = words
-    if first in ("-h", "--help", "help"):
-        print(HELP)
-        return 0
+    first, *rest = words or [""]
+    if not words or first in ("-h", "--help", "help"):
+        print(HELP, file=sys.stdout if words else sys.stderr)
+        return 0 if words else 2
     if first == "--version":
         print(f"zest {__version__}")
         return 0
