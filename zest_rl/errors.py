@@ -1,4 +1,4 @@
-"""The errors that a user can mend, and how they name what was probably meant."""
+"""The errors that a user can mend, how they name what was probably meant, and the warnings."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ class ZestError(Exception):
 
 class BadInput(ZestError, ValueError):
     """The input breaks a rule; the message says rule, got, expected and what to do. Exit code 2."""
+
+
+class Notice(UserWarning):
+    """What the user should know although the work goes on, such as files that are left out."""
 
 
 def nearest(name: str, valid: Iterable[str], limit: int = 3) -> str:

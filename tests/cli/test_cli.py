@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +22,7 @@ from zest_rl import __version__, cli
 from zest_rl.cli.config import load_config, parse_config, read_recipe
 from zest_rl.cli.terminal import StreamUi
 from zest_rl.cli.ui import SilentUi, Ui
-from zest_rl.errors import BadInput, ZestError
+from zest_rl.errors import BadInput, Notice, ZestError
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,21 @@ def write(folder: Path, text: str) -> Path:
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_a_warning_of_the_library_is_told_like_the_command_s_own(
+    toy: Callable[..., ModuleType], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(config: Any, ui: Ui) -> dict[str, Any]:
+        warnings.warn("a.heic is left out", Notice, stacklevel=1)
+        warnings.warn("of another library", UserWarning, stacklevel=1)
+        return {"made": 1}
+
+    toy(run)
+    with warnings.catch_warnings():  # pytest records them instead
+        warnings.showwarning = lambda *parts: print("shown by Python:", parts[0], file=sys.stderr)
+        assert cli.main(["toy", "a"]) == 0
+    assert capsys.readouterr().err == "warning: a.heic is left out\nshown by Python: of another library\n"
 
 
 def test_help_answers_at_once_and_names_verbs_and_exit_codes() -> None:

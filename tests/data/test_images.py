@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, features
 
-from zest_rl.data.images import list_images, read_image
+from zest_rl.data.images import decode_image, left_out, list_images, read_image
 from zest_rl.errors import BadInput
 
 RED, WHITE = (255, 0, 0), (255, 255, 255)
@@ -26,7 +26,7 @@ def save(path: Path, pixels: np.ndarray | Image.Image, **options: object) -> Pat
     return path
 
 
-@pytest.mark.parametrize("suffix", ["png", "bmp", "gif"])
+@pytest.mark.parametrize("suffix", ["png", "bmp", "gif", "tif", "tiff"])
 def test_a_lossless_file_is_read_exactly(tmp_path: Path, suffix: str) -> None:
     pixels = np.repeat(np.repeat(np.array([[RED, WHITE], [(0, 0, 255), (0, 0, 0)]], np.uint8), 8, axis=0), 8, axis=1)
     frame = read_image(save(tmp_path / f"a.{suffix}", pixels))
@@ -34,7 +34,17 @@ def test_a_lossless_file_is_read_exactly(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_array_equal(frame, pixels)
 
 
-@pytest.mark.parametrize(("suffix", "options"), [("jpg", {"quality": 95}), ("webp", {"quality": 95})])
+@pytest.mark.parametrize(
+    ("suffix", "options"),
+    [
+        ("jpg", {"quality": 95}),
+        ("jfif", {"quality": 95, "format": "JPEG"}),
+        ("webp", {"quality": 95}),
+        pytest.param(
+            "avif", {"quality": 95}, marks=pytest.mark.skipif(not features.check("avif"), reason="this Pillow has none")
+        ),
+    ],
+)
 def test_a_lossy_file_is_read_to_within_its_loss(tmp_path: Path, suffix: str, options: dict[str, object]) -> None:
     frame = read_image(save(tmp_path / f"a.{suffix}", picture(), **options))
     assert np.abs(frame.astype(int) - picture()).max() < 16
@@ -160,7 +170,7 @@ def test_an_empty_a_missing_and_a_foreign_file_are_refused_by_name(tmp_path: Pat
         read_image(tmp_path / "empty.png")
     with pytest.raises(BadInput, match=r"notes\.png is not an image.*convert it to PNG"):
         read_image(tmp_path / "notes.png")
-    with pytest.raises(BadInput, match=r"none\.png is not a file"):
+    with pytest.raises(BadInput, match=r"none\.png does not exist"):
         read_image(tmp_path / "none.png")
 
 
@@ -172,16 +182,59 @@ def test_a_huge_image_is_refused_by_its_header(tmp_path: Path, side: int) -> Non
         read_image(path)
 
 
+@pytest.mark.parametrize("shape", [(1, 16_000_000), (16_000, 100)])
+def test_a_long_image_is_refused_by_its_header(tmp_path: Path, shape: tuple[int, int]) -> None:
+    path = save(tmp_path / "line.png", Image.new("1", shape))
+    with pytest.raises(BadInput, match=r"line\.png is too long: .* one side may be 100 times the other"):
+        read_image(path)
+
+
+def test_a_heic_picture_is_named_whatever_its_suffix(tmp_path: Path) -> None:
+    (tmp_path / "IMG_1.JPG").write_bytes(b"\0\0\0\x18ftypheic" + b"x" * 200)
+    with pytest.raises(BadInput, match=r"IMG_1\.JPG is a HEIC picture.*export it as JPEG or PNG"):
+        read_image(tmp_path / "IMG_1.JPG")
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_grey_of_12_bits_in_16_is_refused_rather_than_read_as_black(tmp_path: Path, suffix: str) -> None:
+    grey = picture()[..., 0].astype(np.uint16) * 16
+    with pytest.raises(BadInput, match=rf"a\.{suffix} holds grey values of 0 to 4080, but white is 65535; scale"):
+        read_image(save(tmp_path / f"a.{suffix}", grey))
+    assert read_image(save(tmp_path / "black.png", 0 * grey)).max() == 0
+
+
+def test_floats_in_a_picture_file_are_refused(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.tif", Image.fromarray(picture()[..., 0].astype(np.float32)))
+    with pytest.raises(BadInput, match=r"a\.tif holds floats"):
+        read_image(path)
+
+
+def test_postscript_never_starts_ghostscript(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "gs").write_text(f"#!/bin/sh\ntouch {tmp_path / 'ran'}\n")
+    (tmp_path / "bin" / "gs").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"), prepend=":")
+    page = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 60 40\n%%EndComments\nshowpage\n%%EOF\n"
+    (tmp_path / "page.png").write_bytes(page)
+    for read in (lambda: read_image(tmp_path / "page.png"), lambda: decode_image(page, "a row")):
+        with pytest.raises(BadInput, match="is not an image that can be read"):
+            read()
+    assert not (tmp_path / "ran").exists()
+
+
 def test_images_of_a_folder_are_listed_by_name_without_hidden_and_other_files(tmp_path: Path) -> None:
     for name in ("b.JPG", "a.png", "c.WebP", ".hidden.png", "notes.txt"):
         (tmp_path / name).touch()
     (tmp_path / "folder.png").mkdir()
     assert [path.name for path in list_images(tmp_path)] == ["a.png", "b.JPG", "c.WebP"]
+    for name in ("Thumbs.db", "IMG_1.HEIC"):
+        (tmp_path / name).touch()
+    assert left_out(tmp_path) == ["IMG_1.HEIC", "folder.png/", "notes.txt"]
 
 
 def test_a_folder_without_images_is_refused(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").touch()
-    with pytest.raises(BadInput, match=r"holds no image: 1 files, none of them named .*\*\.png"):
+    with pytest.raises(BadInput, match=r"holds no image, .*\*\.png, .*; it holds notes\.txt: put"):
         list_images(tmp_path)
     with pytest.raises(BadInput, match="none is not a folder"):
         list_images(tmp_path / "none")

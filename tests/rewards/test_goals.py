@@ -10,7 +10,7 @@ from PIL import Image
 
 from zest_rl.data.images import read_image
 from zest_rl.embedders import load_embedder
-from zest_rl.errors import BadInput
+from zest_rl.errors import BadInput, Notice
 from zest_rl.kitchen.tasks import TASKS, Task
 from zest_rl.rewards.goals import VISUAL_TASKS_VARIABLE, GoalSpec, embed_goal, read_folder, read_goal
 
@@ -50,12 +50,22 @@ def test_a_task_without_drawings_is_refused_and_those_with_drawings_are_named() 
         read_goal("drawings", replace(MICRO, name="toaster"))
 
 
+def test_every_file_of_a_goal_folder_that_is_left_out_is_named(folder: Path) -> None:
+    plain = read_folder(folder)
+    (folder / "goal" / "IMG_0001.HEIC").write_bytes(b"\0\0\0\x18ftypheic" + b"x" * 200)
+    (folder / "goal" / "more").mkdir()
+    (folder / "goal" / ".DS_Store").touch()
+    with pytest.warns(Notice, match=r"goal: left out, .*: IMG_0001\.HEIC, more/; convert") as told:
+        assert read_folder(folder).fingerprint() == plain.fingerprint()
+    assert len(told) == 1
+
+
 def test_a_folder_that_is_not_laid_out_as_a_goal_is_refused_with_what_it_holds(folder: Path) -> None:
     shutil.rmtree(folder / "init")
     with pytest.raises(BadInput, match=r"must hold init/ .* and goal/ .*has no init/, it holds goal$"):
         read_goal(str(folder), MICRO)
     (folder / "init").mkdir()
-    with pytest.raises(BadInput, match=r"init holds no image: 0 files"):
+    with pytest.raises(BadInput, match=r"init holds no image, .*; it holds nothing: put"):
         read_goal(str(folder), MICRO)
     shutil.rmtree(folder / "goal")
     shutil.rmtree(folder / "init")

@@ -21,6 +21,7 @@ from typing import Any
 
 from zest_rl import __version__
 from zest_rl.cli.config import parse_config
+from zest_rl.cli.notices import notices_by
 from zest_rl.cli.output import print_failure, print_result
 from zest_rl.cli.streams import print_in_any_encoding
 from zest_rl.cli.terminal import StreamUi
@@ -71,8 +72,9 @@ def _run_verb(module: ModuleType, verb: str, words: list[str]) -> int:
             )
         config_class, verb, words = configs[words[0]], f"{verb} {words[0]}", words[1:]
     config, as_json = parse_config(config_class, words, verb)
-    with redirect_stdout(sys.stderr):  # whatever a library prints must not mix with the result
-        result: dict[str, Any] = module.run(config, StreamUi())
+    ui = StreamUi()
+    with redirect_stdout(sys.stderr), notices_by(ui):  # whatever a library prints must not mix with the result
+        result: dict[str, Any] = module.run(config, ui)
     if result:
         print_result(result, getattr(module, "summary", None), as_json=as_json)
     return 0 if result.get("ok", True) else 1

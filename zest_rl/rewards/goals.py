@@ -14,6 +14,7 @@ A spec is one string:
 from __future__ import annotations
 
 import os
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.data.images import list_images, read_image
-from zest_rl.errors import BadInput
+from zest_rl.data.images import left_out, list_images, read_image
+from zest_rl.errors import BadInput, Notice
 from zest_rl.kitchen.tasks import Task, get_task
 from zest_rl.kitchen.views import Views, scene_pair
 from zest_rl.runtime import artifacts
@@ -65,7 +66,7 @@ class GoalSpec:
 
 
 def read_folder(folder: Path, name: str | None = None) -> GoalSpec:
-    """Read a folder with ``init/`` and ``goal/``.
+    """Read a folder with ``init/`` and ``goal/``; a `Notice` names the files in it that are no images.
 
     Raises:
         BadInput: a folder is missing or empty, or a picture cannot be read.
@@ -81,6 +82,14 @@ def read_folder(folder: Path, name: str | None = None) -> GoalSpec:
                 + problem
             )
     starts, goals = (tuple(read_image(p) for p in list_images(folder / part)) for part in ("init", "goal"))
+    for part in ("init", "goal"):
+        if others := left_out(folder / part):
+            warnings.warn(
+                f"{folder / part}: left out, as they are no images that are read: {', '.join(others)}; convert "
+                "pictures among them, such as HEIC, to JPEG or PNG",
+                Notice,
+                stacklevel=2,
+            )
     return GoalSpec(name or str(folder), starts, goals)
 
 
