@@ -126,6 +126,20 @@ def test_complete_datasets_are_listed_and_staged_ones_are_not(collected: str) ->
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
+def test_datasets_and_namespaces_behind_links_are_listed_and_open(collected: str, tmp_path: Path) -> None:
+    root, elsewhere = reader.datasets_root(), tmp_path / "elsewhere"
+    (root / "zest").rename(elsewhere)
+    (root / "linked").symlink_to(elsewhere, target_is_directory=True)
+    (root / "mine").mkdir()
+    (root / "mine" / "one-v0").symlink_to(elsewhere / collected.split("/")[-1], target_is_directory=True)
+    (elsewhere / "back").symlink_to(root, target_is_directory=True)
+    (root / "nowhere").symlink_to(tmp_path / "gone")
+    listed = reader.list_datasets()
+    assert {"linked/kitchen-micro-tiny-v0", "mine/one-v0"} <= set(listed)
+    for dataset_id in ("linked/kitchen-micro-tiny-v0", "mine/one-v0"):
+        assert len(read(dataset_id, Dataset.episodes)) == 4
+
+
 def test_what_is_read_fits_together(collected: str) -> None:
     episodes, states, truths = (
         read(collected, Dataset.episodes),

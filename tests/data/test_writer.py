@@ -347,7 +347,7 @@ def test_a_disk_that_fills_up_while_relabeling_leaves_the_source_alone(
 
 def test_a_read_only_root_is_refused(small_root: Disk) -> None:
     small_root.make_read_only()
-    with pytest.raises(ZestError, match=r"cannot write .*Read-only file system; choose a folder"):
+    with pytest.raises(ZestError, match=r"cannot write .*Read-only file system; set MINARI_DATASETS_PATH to a"):
         write(random_recordings(1))
 
 

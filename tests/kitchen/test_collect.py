@@ -150,22 +150,41 @@ def test_bad_arguments_end_with_exit_code_2_before_any_episode(words: list[str],
     assert not list(tmp_path.rglob("*.npz"))
 
 
-def test_a_killed_command_goes_on_where_it_stopped_and_ends_with_the_same_dataset(
-    tmp_path: Path, uncut: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def start(*words: str) -> subprocess.Popen[str]:
     code = (
         "import importlib, sys; from zest_rl.cli import main\n"
         f"for module, name, value in {SMALL}: setattr(importlib.import_module(module), name, value)\n"
-        "main(sys.argv[1:])"
+        "sys.exit(main(sys.argv[1:]))"
     )
-    command = subprocess.Popen([sys.executable, "-c", code, *WORDS], stderr=subprocess.DEVNULL)
+    command = [sys.executable, "-c", code, *WORDS, *words]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.parametrize("other", [DATASET, "zest/kitchen-micro-other-v0"], ids=["one-dataset", "the-same-episodes"])
+def test_two_commands_at_once_do_the_work_once_and_both_end_well(
+    other: str, uncut: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    commands = [start("--dataset", dataset_id) for dataset_id in (DATASET, other)]
+    told = [command.communicate(timeout=240) for command in commands]
+    assert [command.returncode for command in commands] == [0, 0], told
+    assert sum("is there already" in err for _, err in told) == (other == DATASET)
+    figures = {"normalized_return", "expert_return", "minimum_return", "n_failed", "noise_max"}
+    for out, _ in told:
+        assert {name: json.loads(out)[name] for name in figures} == {name: uncut[1][name] for name in figures}
+    assert not parts(tmp_path / "cache"), "nothing is left of finished parts"
+
+
+def test_a_killed_command_goes_on_where_it_stopped_and_ends_with_the_same_dataset(
+    tmp_path: Path, uncut: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = start()
     deadline = time.monotonic() + 120
     while not parts(tmp_path / "cache"):
         assert command.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.02)
     command.send_signal(signal.SIGKILL)
-    command.wait()
+    command.communicate()
     assert reader.list_datasets() == []
     assert len(parts(tmp_path / "cache")) < 3
     references = {path: path.stat().st_mtime_ns for path in tmp_path.glob("cache/episodes/*/episodes-2147*.npz")}

@@ -20,10 +20,9 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -49,7 +48,7 @@ _GT_REWARD = "infos/gt/reward"
 
 def datasets_root() -> Path:
     """Minari's folder of local datasets: ``$MINARI_DATASETS_PATH``, else ``~/.minari/datasets``. Not created here."""
-    return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
+    return artifacts.folder_of("MINARI_DATASETS_PATH")
 
 
 def dataset_path(dataset_id: str) -> Path:
@@ -69,8 +68,22 @@ def dataset_path(dataset_id: str) -> Path:
 def list_datasets() -> list[str]:
     """Return the ids of all complete datasets under the root, sorted."""
     root = datasets_root()
-    ids = (p.parent.parent.relative_to(root).as_posix() for p in root.glob(f"**/{METADATA_FILE}"))
-    return sorted(name for name in ids if not any(part.startswith(".") for part in name.split("/")))
+    return sorted(folder.relative_to(root).as_posix() for folder in _datasets_in(root))
+
+
+def _datasets_in(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
+    """Yield the datasets below a folder, links to folders included; `above`: the folders that led here."""
+    here = folder.resolve()
+    if here in above:  # a link that leads back
+        return
+    with suppress(OSError):  # no root yet, or a folder of somebody else
+        for entry in folder.iterdir():
+            if entry.name.startswith(".") or not entry.is_dir():
+                continue
+            if (entry / METADATA_FILE).exists():
+                yield entry
+            else:
+                yield from _datasets_in(entry, (*above, here))
 
 
 def exists(dataset_id: str) -> bool:

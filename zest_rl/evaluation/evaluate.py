@@ -183,33 +183,34 @@ def evaluate(
     for part in chunks(config.n_episodes, max(EPISODES_PER_JOB, config.n_episodes // N_JOBS)):
         seeds = range(config.seed + part.start, config.seed + part.stop)
         jobs[f"seeds-{seeds.start}-{seeds.stop}{'-scored' if scored else ''}"] = (run, config, seeds, scored, device)
-    for name in cached_jobs(_evaluate_part, jobs, folder / "parts", n_workers=n_workers):
-        if on_progress is not None:
-            on_progress(len(jobs[name][2]))
-    traces = read_parts(folder / "parts", jobs)
-    result = Evaluation(
-        run,
-        config,
-        target_return(policy, config),
-        dataset.ref_min_score,
-        dataset.ref_max_score,
-        _episode_results(traces, config),
-        traces,
-    )
-    artifacts.write_json(
-        folder / "result.json",
-        {
-            "config": asdict(config),
-            "agent": policy.agent,
-            "references": {"minimum": result.minimum, "expert": result.expert},
-            "summary": result.summary(),
-            "episodes": [asdict(episode) for episode in result.episodes],
-            "parts": list(jobs),
-            "provenance": artifacts.provenance(),
-        },
-    )
-    if videos:
-        ensure_videos(episode_videos(result).values(), n_workers=n_workers)
+    with artifacts.lock(folder):
+        for name in cached_jobs(_evaluate_part, jobs, folder / "parts", n_workers=n_workers):
+            if on_progress is not None:
+                on_progress(len(jobs[name][2]))
+        traces = read_parts(folder / "parts", jobs)
+        result = Evaluation(
+            run,
+            config,
+            target_return(policy, config),
+            dataset.ref_min_score,
+            dataset.ref_max_score,
+            _episode_results(traces, config),
+            traces,
+        )
+        artifacts.write_json(
+            folder / "result.json",
+            {
+                "config": asdict(config),
+                "agent": policy.agent,
+                "references": {"minimum": result.minimum, "expert": result.expert},
+                "summary": result.summary(),
+                "episodes": [asdict(episode) for episode in result.episodes],
+                "parts": list(jobs),
+                "provenance": artifacts.provenance(),
+            },
+        )
+        if videos:
+            ensure_videos(episode_videos(result).values(), n_workers=n_workers)
     return result
 
 

@@ -107,8 +107,7 @@ def export(
         raise BadInput(f"unknown format {to!r}; {nearest(to, WRITERS)}")
     writer = WRITERS[to]
     path = output or Path(f"{dataset_id.split('/')[-1]}.{writer.suffix}")
-    if path.exists():
-        raise BadInput(f"{path} exists; delete it, or choose another --output")
+    _check_new(path)
     if to == "lerobot-progress" and (shape, normalise) != ("step", False):
         raise BadInput("lerobot-progress holds scores of frames and no rewards; leave --shape and --normalise out")
     with open_dataset(dataset_id) as ds:
@@ -121,12 +120,15 @@ def export(
     write = partial(lerobot.write, fps=fps) if to == "lerobot" else writer.write
     size = sum(array.nbytes for episode in data.episodes for array in episode.values())
     artifacts.check_free_space(path.parent, 2 * size)
-    if writer.is_folder:
-        with artifacts.lock(path), artifacts.staged_folder(path) as staging:
-            write(staging, data)
-    else:
-        with artifacts.atomic_path(path) as temporary:
-            write(temporary, data)
+    with artifacts.lock(path):
+        _check_new(path)  # an equal command may have run at the same time
+        with artifacts.staged_folder(path) if writer.is_folder else artifacts.atomic_path(path) as place:
+            write(place, data)
     files = [file for file in (path, *path.rglob("*")) if file.is_file()]
     n_bytes = sum(file.stat().st_size for file in files)
     return Exported(path, len(data.episodes), len(data), tuple(data.episodes[0]), n_bytes, data.left_out)
+
+
+def _check_new(path: Path) -> None:
+    if path.exists():
+        raise BadInput(f"{path} exists; delete it, or choose another --output")

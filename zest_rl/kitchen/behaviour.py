@@ -7,6 +7,7 @@ trajectory, are fields of `Behaviour`.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -148,10 +149,18 @@ def run_behaviour(
     for part in chunks(n_episodes, EPISODES_PER_JOB):
         indices = range(first + part.start, first + part.stop)
         jobs[f"episodes-{indices.start}-{indices.stop}"] = (behaviour, indices)
-    for name in cached_jobs(_rollouts, jobs, folder, n_workers=n_workers):
-        if on_progress is not None:
-            on_progress(len(jobs[name][1]))
-    return read_parts(folder, jobs)
+    with artifacts.lock(folder):
+        for name in cached_jobs(_rollouts, jobs, folder, n_workers=n_workers):
+            if on_progress is not None:
+                on_progress(len(jobs[name][1]))
+        return read_parts(folder, jobs)
+
+
+def remove_parts(behaviour: Behaviour) -> None:
+    """Remove what `run_behaviour` kept, once no other command reads it."""
+    folder = behaviour_folder(behaviour)
+    with artifacts.lock(folder):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def behaviour_folder(behaviour: Behaviour) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -15,7 +14,7 @@ from zest_rl.data.provenance import CollectRecord
 from zest_rl.data.writer import write_dataset
 from zest_rl.errors import BadInput
 from zest_rl.kitchen import calibration
-from zest_rl.kitchen.behaviour import Behaviour, behaviour_folder, recordings, returns, run_behaviour
+from zest_rl.kitchen.behaviour import Behaviour, recordings, remove_parts, returns, run_behaviour
 from zest_rl.kitchen.calibration import TOLERANCE, References, calibrate, measure_references
 from zest_rl.kitchen.collect_config import LARGEST, CollectConfig
 from zest_rl.kitchen.env import ENV_ID, env_spec
@@ -59,8 +58,23 @@ def collect_dataset(
     path = reader.dataset_path(config.dataset_id)
     asked = {field.name: getattr(config, field.name) for field in fields(CollectConfig) if field.name != "dataset"}
     asked["env"] = ENV_ID
-    if reader.exists(config.dataset_id):
-        return Collected(config.dataset_id, path, _collected_before(config, asked, path), already_there=True)
+    if not reader.exists(config.dataset_id):
+        with artifacts.lock(path):  # of two equal commands the second one finds the work done
+            if not reader.exists(config.dataset_id):
+                result = _collect(config, asked, path, n_workers, on_progress, on_result)
+                return Collected(config.dataset_id, path, result, already_there=False)
+    return Collected(config.dataset_id, path, _collected_before(config, asked, path), already_there=True)
+
+
+def _collect(
+    config: CollectConfig,
+    asked: Mapping[str, Any],
+    path: Path,
+    n_workers: int | None,
+    on_progress: Callable[[int, int], None],
+    on_result: Callable[[str], None],
+) -> dict[str, Any]:
+    """Do the work of `collect_dataset`, and return its result."""
     n_references = calibration.N_REFERENCE + calibration.N_NOTHING
     done = 0
 
@@ -96,10 +110,10 @@ def collect_dataset(
         description=f"Kitchen task {config.task}: {config.n_episodes} episodes of 100 steps by a scripted expert with "
         + (", ".join(f"{name} {value}" for name, value in flaws.items() if value) or "no flaws")
         + " (drawn per episode, see zest_rl.kitchen.behaviour.Behaviour).",
-        zest={"collect": {"asked": asked, "result": result, "provenance": artifacts.provenance()}},
+        zest={"collect": {"asked": dict(asked), "result": result, "provenance": artifacts.provenance()}},
     )
-    shutil.rmtree(behaviour_folder(behaviour), ignore_errors=True)
-    return Collected(config.dataset_id, path, result, already_there=False)
+    remove_parts(behaviour)
+    return result
 
 
 def _result(episodes: Arrays, flaws: Mapping[str, float], references: References) -> dict[str, Any]:

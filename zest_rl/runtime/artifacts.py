@@ -1,21 +1,25 @@
 """Artifacts on disk: atomic writes, content hashes, locks, provenance.
 
 A file or folder under its final name is complete. Everything is built under a temporary name in the same folder and
-renamed once, so an interruption at any point leaves either the old artifact or the new one.
+renamed once, so an interruption at any point leaves either the old artifact or the new one. Temporary files that a
+killed process left are removed by the next one that writes to their folder.
 """
 
 from __future__ import annotations
 
+import errno
+import functools
 import hashlib
 import importlib.metadata
 import json
 import os
 import platform
 import re
+import secrets
 import shutil
 import subprocess
 import sys
-import tempfile
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,9 +36,35 @@ PACKAGES = (
 )  # fmt: skip
 
 
+FOLDERS = {"MINARI_DATASETS_PATH": (".minari", "datasets"), "ZEST_CACHE": (".cache", "zest_rl")}
+"""Variables that name folders, and where these are in the home folder without the variable."""
+PATIENCE = 1.0
+"""Seconds of waiting for a lock after which the user is told."""
+_TEMPORARY = re.compile(r"\..+\.([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.tmp.*")
+"""Of `atomic_path`: the machine and the process that write the file."""
+_A_DAY = 86_400.0
+
+
+def folder_of(variable: str) -> Path:
+    """Return the folder that one of `FOLDERS` names, by default below the home folder. Not created here.
+
+    Raises:
+        ZestError: the variable is not set, and there is no home folder.
+    """
+    if value := os.environ.get(variable):
+        return Path(value)
+    try:
+        return Path.home().joinpath(*FOLDERS[variable])
+    except RuntimeError as error:
+        raise ZestError(
+            f"this account has no home folder; set HOME, or each of {' and '.join(FOLDERS)}, to a folder that can be "
+            "written to"
+        ) from error
+
+
 def cache_dir() -> Path:
     """Return the folder of recomputable files: ``$ZEST_CACHE``, else ``~/.cache/zest_rl``. Not created here."""
-    return Path(os.environ.get("ZEST_CACHE") or Path.home() / ".cache" / "zest_rl")
+    return folder_of("ZEST_CACHE")
 
 
 def hash_bytes(data: bytes) -> str:
@@ -75,6 +105,60 @@ def _fsync(path: Path) -> None:
         os.close(handle)
 
 
+def _cannot_write(path: Path, error: OSError) -> ZestError:
+    """Say why, and which variable or argument chooses another folder."""
+    variable = next((name for name in FOLDERS if _is_below(path, name)), None)
+    choice = f"set {variable} to" if variable else "choose"
+    if error.errno in (errno.ENOLCK, errno.EOPNOTSUPP):
+        return ZestError(
+            f"the file system of {path.parent} has no file locks ({error.strerror}), without which two commands could "
+            f"write {path.name} at once; {choice} a folder on another file system, or mount this one with locks (NFS: "
+            "without the option nolock)"
+        )
+    return ZestError(f"cannot write {path}: {error.strerror or error}; {choice} a folder that can be written to")
+
+
+def _is_below(path: Path, variable: str) -> bool:
+    try:
+        return path.absolute().is_relative_to(folder_of(variable).absolute())
+    except ZestError:  # no home folder
+        return False
+
+
+@functools.cache
+def _machine() -> str:
+    """Tell apart machines and containers, whose process ids mean different processes."""
+    namespace = Path("/proc/self/ns/pid")
+    return hash_json([platform.node(), str(namespace.readlink()) if namespace.exists() else ""])[:8]
+
+
+def _is_stale(file: os.DirEntry[str]) -> bool:
+    """Whether the process that wrote a temporary file is gone; one of another machine is after an idle day."""
+    match = _TEMPORARY.fullmatch(file.name)
+    if match is None:
+        return False
+    machine, process = match.groups()
+    if machine != _machine():
+        return time.time() - file.stat().st_mtime > _A_DAY
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return True
+    except PermissionError:  # of another user
+        return False
+    return False
+
+
+def _new_temporary(path: Path) -> Path:
+    """Make an empty file beside `path`, with the permissions of any new file, and remove the stale ones there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for file in filter(_is_stale, os.scandir(path.parent)):
+        Path(file).unlink(missing_ok=True)
+    temporary = path.with_name(f".{path.name}.{_machine()}-{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+    return temporary
+
+
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success it is flushed and renamed to `path`, on failure removed.
@@ -83,15 +167,11 @@ def atomic_path(path: Path) -> Iterator[Path]:
         ZestError: the folder cannot be written to (read-only, full).
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-        os.close(handle)
+        temporary = _new_temporary(path)
     except OSError as error:
-        raise ZestError(f"cannot write {path}: {error.strerror}; choose a folder that can be written to") from error
-    temporary = Path(name)
+        raise _cannot_write(path, error) from error
     try:
         yield temporary
-        temporary.chmod(0o644)
         _fsync(temporary)
         temporary.replace(path)
     except OSError as error:
@@ -139,7 +219,7 @@ def staged_folder(final: Path) -> Iterator[Path]:
         shutil.rmtree(staging, ignore_errors=True)
         staging.mkdir(parents=True)
     except OSError as error:
-        raise ZestError(f"cannot write {final}: {error.strerror}; choose a folder that can be written to") from error
+        raise _cannot_write(final, error) from error
     try:
         yield staging
         for path in [*staging.rglob("*"), staging]:
@@ -154,16 +234,24 @@ def staged_folder(final: Path) -> Iterator[Path]:
 
 @contextmanager
 def lock(target: Path) -> Iterator[None]:
-    """Hold the lock of an artifact; a second process waits (a killed process frees its lock). May be nested."""
-    from filelock import FileLock
+    """Hold the lock of an artifact; a second process says that it waits (a killed one frees its lock). May be nested.
+
+    Raises:
+        ZestError: the folder cannot be written to, or its file system has no locks.
+    """
+    from filelock import FileLock, Timeout
 
     path = target.parent / f".{target.name}.lock"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         held = FileLock(path, is_singleton=True)
-        held.acquire()
+        try:
+            held.acquire(timeout=PATIENCE)
+        except Timeout:
+            print(f"waiting for {path}, which another command holds until {target} is written", file=sys.stderr)
+            held.acquire()
     except OSError as error:
-        raise ZestError(f"cannot write {target}: {error.strerror}; choose a folder that can be written to") from error
+        raise _cannot_write(target, error) from error
     try:
         yield
     finally:

@@ -67,13 +67,16 @@ def reproduce(
         BadInput: the recipe is wrong; nothing has run then.
         ZestError: a stage failed; what was finished is kept.
     """
+    from zest_rl.runtime import artifacts
+
     ui = SilentUi() if ui is None else ui
     output = output or Path("runs") / file.stem
     recipe = read_recipe(file)
-    if recipe.get("verb") in VERBS:
-        return _run_verb(recipe, f"recipe {file}", output, ui, n_workers)
-    run_recipe = run_study if "study" in recipe else run_comparison
-    return run_recipe(file, output, ui, n_workers=n_workers)
+    with artifacts.lock(output):
+        if recipe.get("verb") in VERBS:
+            return _run_verb(recipe, f"recipe {file}", output, ui, n_workers)
+        run_recipe = run_study if "study" in recipe else run_comparison
+        return run_recipe(file, output, ui, n_workers=n_workers)
 
 
 def _run_verb(recipe: dict[str, Any], source: str, output: Path, ui: Ui, n_workers: int | None) -> dict[str, Any]:
