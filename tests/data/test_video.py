@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from zest_rl.data.video import frame_files, iter_frames, read_frames
+from zest_rl.data.video import frame_files, frame_times, iter_frames, read_frames
 from zest_rl.errors import BadInput
 
 N = 12
@@ -67,17 +67,75 @@ def test_pictures_are_taken_in_the_order_of_their_numbers(tmp_path: Path) -> Non
     assert [int(frame[0, 0, 0]) for frame in read_frames(tmp_path, 12)] == [20 * i for i in range(12)]
 
 
-@pytest.mark.parametrize("content", [b"no video", b""])
-def test_what_is_no_video_is_refused_by_name(tmp_path: Path, content: bytes) -> None:
+BOTH = (lambda path: read_frames(path, 4), lambda path: list(iter_frames(path)), frame_times)
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"a" * 64 + b"\nsize 123456\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"no video", r"cannot be read as a video \([^()]{5,80}\); copy it"),
+        (b"", "is empty"),
+        (POINTER, "is a Git LFS pointer"),
+    ],
+)
+def test_what_is_no_video_is_refused_by_name_in_one_line(tmp_path: Path, content: bytes, message: str) -> None:
     (tmp_path / "odd.webm").write_bytes(content)
-    for read in (lambda path: read_frames(path, 4), lambda path: list(iter_frames(path))):
-        with pytest.raises(BadInput, match=r"odd\.webm cannot be read as a video"):
+    for read in BOTH:
+        with pytest.raises(BadInput, match=rf"odd\.webm {message}") as refused:
             read(tmp_path / "odd.webm")
+        assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "playlist",
+    ["ffconcat version 1.0\nfile {}\n", "#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\n{}\n#EXT-X-ENDLIST\n"],
+)
+def test_a_playlist_under_the_name_of_a_video_does_not_lead_to_other_files(
+    bar: list[np.ndarray], tmp_path: Path, playlist: str
+) -> None:
+    imageio.mimwrite(tmp_path / "secret.mp4", bar, fps=12)
+    for name in ("list.mp4", "list.mkv"):
+        (tmp_path / name).write_text(playlist.format(tmp_path / "secret.mp4"))
+        for read in BOTH:
+            with pytest.raises(BadInput, match=rf"{name} cannot be read as a video"):
+                read(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("size", "message"), [("8000x4000", "exceeds specified max pixel count 16000000"), ("8000x40", "is too long")]
+)
+def test_a_video_of_absurd_size_is_refused(tmp_path: Path, size: str, message: str) -> None:
+    words = ["-v", "error", "-f", "lavfi", "-i", f"color=size={size}:rate=1:duration=1", "-c:v", "mjpeg"]
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *words, tmp_path / "wide.mkv"], check=True)
+    with pytest.raises(BadInput, match=message):
+        list(iter_frames(tmp_path / "wide.mkv"))
+
+
+@pytest.mark.parametrize("quarters", [0, 1, 2, 3])
+def test_a_video_is_shown_as_it_was_held(bar: list[np.ndarray], tmp_path: Path, quarters: int) -> None:
+    imageio.mimwrite(tmp_path / "plain.mp4", [frame[:40] for frame in bar], fps=12, macro_block_size=2)
+    words = ["-v", "error", "-display_rotation", str(90 * quarters), "-i", tmp_path / "plain.mp4", "-c", "copy"]
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *words, tmp_path / "held.mp4"], check=True)
+    turned = [np.rot90(frame, quarters) for frame in iter_frames(tmp_path / "plain.mp4")]
+    for frame, expected in zip(iter_frames(tmp_path / "held.mp4"), turned, strict=True):
+        assert frame.shape == expected.shape
+        assert np.abs(frame.astype(int) - expected).mean() < 2
+
+
+def test_a_part_of_a_video_is_read_by_the_times_of_its_frames(bar: list[np.ndarray], tmp_path: Path) -> None:
+    path = tmp_path / "file:bar 1.mp4"
+    imageio.mimwrite(path, bar, fps=10, output_params=["-bf", "3", "-g", "12"])
+    np.testing.assert_allclose(frame_times(path), np.arange(N) / 10, atol=1e-3)
+    frames = list(iter_frames(path))
+    np.testing.assert_array_equal(list(iter_frames(path, 0.45, 3)), frames[5:8])
+    with pytest.raises(BadInput, match="it holds no frame after 9 s"):
+        list(iter_frames(path, 9.0))
 
 
 def test_too_few_frames_are_refused(tmp_path: Path) -> None:
     Image.new("RGB", (8, 8)).save(tmp_path / "only.png")
-    with pytest.raises(BadInput, match="is not a file"):
+    with pytest.raises(BadInput, match="does not exist"):
         read_frames(tmp_path / "nowhere.mp4", 4)
     with pytest.raises(BadInput, match="at least 2 frames"):
         read_frames(tmp_path, 1)

@@ -79,13 +79,16 @@ def something_something(root: Path, things: Sequence[str] = OBJECTS, template: s
         try:
             entries = json.loads(file.read_text(encoding="utf-8"))
             for entry in entries:
-                templates.add(entry["template"])
+                templates.add(str(entry["template"]))
                 if entry["template"] == template:
                     thing = _object_of(str(entry["placeholders"][0]).lower().strip(), things)
-                    path = root / VIDEOS / f"{entry['id']}.webm"
+                    name = f"{entry['id']}.webm"
+                    if name != Path(name).name:
+                        raise ValueError(f"{name!r} is no file name")
+                    path = root / VIDEOS / name
                     if thing is not None and path.is_file():
                         clips.append(Clip(path, thing))
-        except (ValueError, KeyError, TypeError, IndexError) as error:
+        except (ValueError, KeyError, TypeError, IndexError, RecursionError, MemoryError) as error:
             raise BadInput(f"{file} is not a list of labels ({error!r}); download it again") from error
     if template not in templates:
         raise BadInput(f"no clip is of {template!r}; {nearest(template, templates)}")

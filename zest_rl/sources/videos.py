@@ -14,6 +14,7 @@ from typing import Any
 from zest_rl.data.video import VIDEO_SUFFIXES, frame_files, iter_frames
 from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.files import check_file
 from zest_rl.types import Frame
 
 _NAME = re.compile(r"episode_0*(\d+)")
@@ -75,6 +76,8 @@ def find_videos(folders: Sequence[Path], n_episodes: int, what: str) -> EpisodeV
                 continue
             if (number := int(name[1])) in by_number:
                 raise BadInput(f"{path} and {by_number[number].name} are both of episode {number}; remove one")
+            if not path.is_dir():
+                check_file(path)
             by_number[number] = path
         missing = [number for number in range(n_episodes) if number not in by_number]
         if missing or len(by_number) > n_episodes:
