@@ -283,8 +283,15 @@ def test_an_object_with_few_clips_is_left_out_and_named(root: Path, capsys: pyte
     ("spoil", "message"),
     [
         (lambda root: (root / VIDEOS / "1000.webm").write_bytes(b"no video"), r"1000\.webm cannot be read as a video"),
-        (lambda root: (root / VIDEOS / "1000.webm").write_bytes(b""), r"1000\.webm cannot be read as a video"),
+        (lambda root: (root / VIDEOS / "1000.webm").write_bytes(b""), r"1000\.webm is empty"),
         (lambda root: (root / LABELS[0]).write_text("{"), "is not a list of labels"),
+        (lambda root: (root / LABELS[0]).write_text("[" * 100_000), "is not a list of labels"),
+        (
+            lambda root: (root / LABELS[0]).write_text(
+                json.dumps([{"id": "../../other", "template": "Opening [something]", "placeholders": ["a door"]}])
+            ),
+            r"'\.\./\.\./other\.webm' is no file name",
+        ),
         (lambda root: (root / LABELS[0]).write_text("[]"), "no clip is of 'Opening"),
         (lambda root: (root / LABELS[0]).unlink(), "as Something-Something V2 does"),
     ],
