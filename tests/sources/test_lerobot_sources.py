@@ -1,4 +1,4 @@
-"""LeRobot's folders, in the layout of their format."""
+"""`zest relabel` on LeRobot's folders."""
 
 from __future__ import annotations
 
@@ -12,88 +12,15 @@ import h5py
 import imageio.v2 as imageio
 import minari
 import numpy as np
-import pyarrow
-import pyarrow.parquet
 import pytest
+from lerobot_files import write_lerobot
 from PIL import Image
 from read_dataset import read
-from rollouts import LENGTHS, SIDE, Episode, Run, check_imported, rows, write_blind
+from rollouts import LENGTHS, Episode, Run, check_imported, rows, write_blind
 
 from zest_rl.data import reader
 from zest_rl.data.reader import Dataset
 from zest_rl.sources import open_source
-
-
-def write_lerobot(root: Path, maze: list[Episode], *, version: str = "v3.0", number: int = 0, step: int = 1) -> Path:
-    """The layout of https://huggingface.co/docs/lerobot/lerobot-dataset-v3: two episodes in the first files."""
-    fps, key = 10, "observation.images.top"
-    rows_of, first = [], 0
-    for i, episode in enumerate(maze):
-        n_steps = len(episode.actions)
-        rows_of.append(
-            {
-                "observation.state": rows(episode, "observation")[:-1].astype(np.float32).tolist(),
-                "action": episode.actions.tolist(),
-                "next.reward": (episode.rewards + i).astype(np.float32).tolist(),
-                "next.done": (np.arange(n_steps) == n_steps - 1).tolist(),
-                "next.truncated": [False] * n_steps,
-                "timestamp": (np.arange(n_steps) / fps).astype(np.float32).tolist(),
-                "frame_index": list(range(n_steps)),
-                "episode_index": [number + step * i] * n_steps,
-                "index": list(range(first, first + n_steps)),
-                "task_index": [0] * n_steps,
-            }
-        )
-        first += n_steps
-    listed = []
-    for file, members in enumerate(([0, 1], [2])):
-        data_file, video = (f"{at}/chunk-000/file-{file:03d}" for at in ("data", f"videos/{key}"))
-        for path in (data_file, video):
-            (root / path).parent.mkdir(parents=True, exist_ok=True)
-        columns = {name: [value for i in members for value in rows_of[i][name]] for name in rows_of[0]}
-        pyarrow.parquet.write_table(pyarrow.table(columns), root / f"{data_file}.parquet")
-        frames = [frame for i in members for frame in maze[i].frames[:-1]]
-        imageio.mimwrite(root / f"{video}.mp4", frames, fps=fps, codec="libx264", quality=9, macro_block_size=2)
-        start = 0.0
-        for i in members:
-            length = len(maze[i].actions)
-            place = {"chunk_index": 0, "file_index": file}
-            listed.append(
-                {
-                    "episode_index": number + step * i,
-                    "tasks": ["go there"],
-                    "length": length,
-                    **{f"data/{name}": value for name, value in place.items()},
-                    **{f"videos/{key}/{name}": value for name, value in place.items()},
-                    f"videos/{key}/from_timestamp": start,
-                    f"videos/{key}/to_timestamp": start + length / fps,
-                    "stats/action/mean": [0.0, 0.0],
-                }
-            )
-            start += length / fps
-    (root / "meta" / "episodes" / "chunk-000").mkdir(parents=True)
-    table = pyarrow.Table.from_pylist(listed)
-    pyarrow.parquet.write_table(table, root / "meta" / "episodes" / "chunk-000" / "file-000.parquet")
-    one = {"dtype": "float32", "names": None}
-    features = {
-        key: {"dtype": "video", "shape": [SIDE, SIDE, 3], "info": {"video.is_depth_map": False}},
-        "observation.state": {**one, "shape": [4]},
-        "action": {**one, "shape": [2]},
-        "next.reward": {**one, "shape": [1]},
-        "next.done": {"dtype": "bool", "shape": [1]},
-        "next.truncated": {"dtype": "bool", "shape": [1]},
-        "episode_index": {"dtype": "int64", "shape": [1]},
-    }
-    info = {
-        "codebase_version": version,
-        "total_episodes": len(maze),
-        "fps": fps,
-        "features": features,
-        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
-    }
-    (root / "meta" / "info.json").write_text(json.dumps(info))
-    return root
 
 
 def test_a_lerobot_folder_becomes_a_minari_dataset(
@@ -119,7 +46,7 @@ def test_a_lerobot_folder_becomes_a_minari_dataset(
         assert json.loads((Path(back["file"]) / "meta" / "info.json").read_text())["fps"] == fps
     videos[1].unlink()
     code, error = refusal("relabel", root, "--goal", goal)
-    assert (code, "lacks videos/observation.images.top/chunk-000/file-001.mp4" in error) == (2, True)
+    assert (code, "episode 2 lacks videos/observation.images.top/chunk-000/file-001.mp4" in error) == (2, True)
 
 
 def test_a_part_of_a_lerobot_dataset_keeps_its_order_whatever_its_numbers(
@@ -152,7 +79,7 @@ def test_a_lerobot_folder_whose_info_lacks_a_part_is_refused(
     path = write_lerobot(tmp_path / "pusht", maze) / "meta" / "info.json"
     path.write_text(json.dumps({name: value for name, value in json.loads(path.read_text()).items() if name != lost}))
     code, error = refusal("relabel", tmp_path / "pusht", "--goal", goal)
-    assert (code, f"is not that of a LeRobot v3.0 dataset ({lost!r})" in error) == (2, True)
+    assert (code, f"is not that of a LeRobot v3.0 dataset ({lost!r} in info.json)" in error) == (2, True)
 
 
 def test_without_next_truncated_an_episode_of_lerobot_counts_as_cut(maze: list[Episode], tmp_path: Path) -> None:

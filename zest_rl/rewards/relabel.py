@@ -102,6 +102,7 @@ def relabel(
     views: int = Views.n_views,
     show_robot: bool = Views.robot,
     tolerance: float = Views.tolerance,
+    skip_incomplete: bool = False,
     embedder: str = DEFAULT_EMBEDDER,
     features: Features = "delta",
     similarity: Similarity = "cos",
@@ -111,12 +112,18 @@ def relabel(
 ) -> Relabeled:
     """Write a copy of a dataset whose rewards are ZeST scores, with the arguments of `zest relabel`.
 
-    `dataset` and `frames` … `tolerance` choose the frames (`open_source`), `goal` and `embedder` … `goal_share` the
-    scorer (`ScorerConfig`); the other options and the errors are those of `relabel_source`.
+    `dataset` and `frames` … `skip_incomplete` choose the frames (`open_source`), `goal` and `embedder` … `goal_share`
+    the scorer (`ScorerConfig`); the other options and the errors are those of `relabel_source`.
     """
     config = ScorerConfig(goal, embedder, features, similarity, precision, goal_share)
     source = open_source(
-        dataset, frames=frames, cameras=camera, n_views=views, show_robot=show_robot, tolerance=tolerance
+        dataset,
+        frames=frames,
+        cameras=camera,
+        n_views=views,
+        show_robot=show_robot,
+        tolerance=tolerance,
+        skip_incomplete=skip_incomplete,
     )
     return relabel_source(source, config, **options)
 

@@ -35,8 +35,8 @@ def check_file(path: Path) -> None:
         )
 
 
-def file_under(root: Path, name: str) -> Path:
-    """Return the file that data in a folder name.
+def path_under(root: Path, name: str) -> Path:
+    """Return where a file is that data in a folder name, whether or not it exists.
 
     The name itself may not leave the folder. Links in the folder may: downloads of the Hugging Face Hub keep a
     snapshot's files in ``../../blobs``.
@@ -46,10 +46,19 @@ def file_under(root: Path, name: str) -> Path:
         name: relative to it.
 
     Raises:
-        BadInput: the name is absolute or goes up, or the file is one that `check_file` refuses.
+        BadInput: the name is absolute or goes up.
     """
     if Path(name).is_absolute() or ".." in Path(name).parts:
         raise BadInput(f"{root} names the file {name!r}, which is outside that folder; do not use this download")
-    path = root / name
+    return root / name
+
+
+def file_under(root: Path, name: str) -> Path:
+    """Return the file that data in a folder name.
+
+    Raises:
+        BadInput: as in `path_under`, or the file is one that `check_file` refuses.
+    """
+    path = path_under(root, name)
     check_file(path)
     return path

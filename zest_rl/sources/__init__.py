@@ -46,6 +46,7 @@ def open_source(
     n_views: int = Views.n_views,
     show_robot: bool = Views.robot,
     tolerance: float = Views.tolerance,
+    skip_incomplete: bool = False,
 ) -> Source:
     """Find a dataset's episodes and their frames.
 
@@ -57,6 +58,7 @@ def open_source(
         n_views: kitchen only: cameras around the object.
         show_robot: kitchen only: keep the robot in view.
         tolerance: kitchen only: grid of the states, see `Views`.
+        skip_incomplete: LeRobot only: leave out episodes without steps, and those whose files are missing.
 
     Raises:
         BadInput: no such dataset, or its frames are missing or ambiguous; the message lists the candidates.
@@ -76,6 +78,8 @@ def open_source(
             )
         if frames and cameras:
             raise BadInput("--camera renders recorded states, --frames says where pictures are; give one of them")
+        if skip_incomplete and (ds is not None or not Path(dataset).expanduser().is_dir()):
+            raise BadInput("--skip-incomplete is for LeRobot folders alone; leave it out")
         folders = [path.resolve() for path in (Path(name).expanduser() for name in frames) if path.is_dir()]
         if folders and len(folders) < len(frames):
             raise BadInput(f"--frames must be folders or entries of the dataset, not both; got {', '.join(frames)}")
@@ -85,7 +89,9 @@ def open_source(
         if ds is None:
             if cameras:
                 raise BadInput("--camera renders the states of Minari datasets alone; leave it out")
-            trajectories, episode_frames = _open_path(Path(dataset).expanduser(), keys, with_frames=not folders)
+            trajectories, episode_frames = _open_path(
+                Path(dataset).expanduser(), keys, with_frames=not folders, skip_incomplete=skip_incomplete
+            )
         else:
             episode_frames = None if folders else _minari_frames(ds, keys, cameras)
             trajectories = DatasetCopy.of(ds)
@@ -96,16 +102,20 @@ def open_source(
     return Source(trajectories, episode_frames)
 
 
-def _open_path(path: Path, keys: Sequence[str], *, with_frames: bool) -> tuple[Trajectories, EpisodeFrames | None]:
+def _open_path(
+    path: Path, keys: Sequence[str], *, with_frames: bool, skip_incomplete: bool
+) -> tuple[Trajectories, EpisodeFrames | None]:
     from zest_rl.sources.lerobot import is_lerobot, open_lerobot
     from zest_rl.sources.robomimic import open_robomimic
 
-    if path.is_dir() and not is_lerobot(path):
+    if is_lerobot(path):
+        return open_lerobot(path, keys, with_frames=with_frames, skip_incomplete=skip_incomplete)
+    if path.is_dir():
         raise BadInput(
             f"{path} is a folder, but no LeRobot dataset (it has no meta/info.json); give a Minari id, a robomimic "
             "HDF5 file or a LeRobot folder"
         )
-    return (open_lerobot if path.is_dir() else open_robomimic)(path, keys, with_frames=with_frames)
+    return open_robomimic(path, keys, with_frames=with_frames)
 
 
 def _minari_frames(ds: reader.Dataset, keys: Sequence[str], cameras: Sequence[str]) -> EpisodeFrames:

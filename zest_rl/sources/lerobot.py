@@ -16,6 +16,7 @@ last ``next.truncated`` is false, and as truncated where either is not recorded.
 from __future__ import annotations
 
 import functools
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,22 +24,20 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import imageio_ffmpeg
 import numpy as np
 
-from zest_rl.data.observations import choose_pictures
+from zest_rl.data.video import frame_times, iter_frames
 from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.files import check_file
 from zest_rl.sources.conversion import ConvertedEpisode, ConvertedTrajectories
+from zest_rl.sources.lerobot_meta import INFO, MAX_ROWS, OTHERS, Info, complete_episodes, read_listing
+from zest_rl.sources.parquet import as_numbers, open_parquet, read_table
 from zest_rl.types import FloatArray, Frame
-
-INFO = Path("meta", "info.json")
-_NUMBERS = ("float16", "float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool")
-_OTHERS = ("action", "next.reward", "next.done", "next.truncated", "next.success")
 
 
 def read_episodes(
-    root: Path, files: Sequence[tuple[str, Sequence[int]]], n_steps: Sequence[int], columns: Sequence[str]
+    root: Path, files: Sequence[tuple[str, Sequence[int]]], n_steps: Sequence[int], columns: Mapping[str, str]
 ) -> Iterator[ConvertedEpisode]:
     """Read one data file at a time; LeRobot limits each to 100 MB.
 
@@ -46,39 +45,54 @@ def read_episodes(
         root: the dataset's folder.
         files: data files, relative to the root, each with the ``episode_index`` of the episodes read from it, in order.
         n_steps: T of every episode.
-        columns: observed numbers, and those of `_OTHERS` in the dataset.
-    """
-    import pyarrow.compute
-    import pyarrow.parquet
+        columns: observed numbers, and those of `OTHERS` in the dataset, by their names here; their names in the files.
 
-    lengths = iter(n_steps)
+    Raises:
+        BadInput: a file is damaged, or an episode in it is not what ``meta/episodes`` says, or holds no finite numbers.
+    """
+    lengths, widths = iter(n_steps), dict[str, int]()
     for file, members in files:
-        table = pyarrow.parquet.read_table(root / file, columns=["episode_index", *columns])
+        table = read_table(root / file, ["episode_index", *columns.values()], MAX_ROWS)
         for episode in members:
-            rows = table.filter(pyarrow.compute.equal(table["episode_index"], episode))
+            rows, where = _rows_of(table, episode), f"episode {episode} in {root / file}"
             if len(rows) != (length := next(lengths)):
                 raise BadInput(
                     f"{root / file} has {len(rows)} rows of episode {episode}, but meta/episodes says {length}; "
                     "download the dataset again"
                 )
-            yield _converted({name: _column(rows[name]) for name in columns})
+            read = {name: as_numbers(rows[column], f"{column} of {where}") for name, column in columns.items()}
+            for name, values in read.items():
+                finite = np.isfinite(values).all(axis=1)
+                if not (finite.all() or name == "next.reward"):
+                    raise BadInput(
+                        f"{columns[name]} of {where} holds NaN or infinity at step {np.argmin(finite)}; repair or "
+                        "leave out the episode"
+                    )
+                if values.shape[1] != widths.setdefault(name, values.shape[1]):
+                    raise BadInput(
+                        f"{columns[name]} of {where} holds {values.shape[1]} numbers per step, but {widths[name]} in "
+                        "the first episode; download the dataset again"
+                    )
+            yield _converted(read)
+
+
+def _rows_of(table: Any, episode: int) -> Any:
+    import pyarrow.compute
+
+    try:
+        return table.filter(pyarrow.compute.equal(table["episode_index"], episode))
+    except pyarrow.ArrowException as error:
+        raise BadInput(f"episode_index must be whole numbers in every file, got {error}") from error
 
 
 def _converted(columns: Mapping[str, FloatArray]) -> ConvertedEpisode:
-    observed = {name: values for name, values in columns.items() if name not in _OTHERS}
+    observed = {name: values for name, values in columns.items() if name not in OTHERS}
     obs = {name: np.concatenate([values, values[-1:]]) for name, values in observed.items()}
     rewards = columns.get("next.reward", np.full((len(columns["action"]), 1), np.nan, np.float32))[:, 0]
     done, truncated = (columns.get(f"next.{end}") for end in ("done", "truncated"))
     terminated = done is not None and truncated is not None and bool(done[-1, 0] and not truncated[-1, 0])
     success = columns["next.success"][:, 0] > 0 if "next.success" in columns else None
     return ConvertedEpisode(obs, columns["action"], rewards, terminated, success)
-
-
-def _column(values: Any) -> FloatArray:
-    """An Arrow column of numbers, or of lists of them: (T, n) float32."""
-    array: Any = values.combine_chunks()
-    flat = array.flatten() if hasattr(array, "flatten") and hasattr(array.type, "value_type") else array
-    return np.asarray(flat.to_numpy(zero_copy_only=False), np.float32).reshape(len(array), -1)
 
 
 @dataclass(frozen=True)
@@ -111,28 +125,37 @@ class Videos:
 
     def read(self, episode: int) -> Iterator[Sequence[Frame]]:
         """Decode all views in step."""
-        return zip(*(_decode(span, self.fps) for span in self.spans[episode]), strict=False)
+        return zip(*(self._decode(span) for span in self.spans[episode]), strict=False)
+
+    def _decode(self, span: Span) -> Iterator[Frame]:
+        """Start half a frame early: the first frame is the one that is not before that."""
+        return iter_frames(span.path, max(0.0, span.start - 0.5 / self.fps), span.n_frames)
+
+    def check(self, episodes: Sequence[int]) -> None:
+        """Compare the times of all frames with those of the steps; nothing is decoded.
+
+        Raises:
+            BadInput: a video is damaged or ends early, or a frame is missing; the message names the episode.
+        """
+        times_of = functools.lru_cache(maxsize=64)(frame_times)  # a video holds many episodes
+        for episode, spans in zip(episodes, self.spans, strict=True):
+            for span in spans:
+                times = times_of(span.path)
+                first = np.searchsorted(times, span.start - 0.5 / self.fps)
+                shown = times[first : first + span.n_frames]
+                late = np.abs(shown - span.start - np.arange(len(shown)) / self.fps) > 0.75 / self.fps
+                if len(shown) < span.n_frames or late.any():
+                    step = int(np.argmax(late)) if late.any() else len(shown)
+                    raise BadInput(
+                        f"{span.path} has no frame for step {step} of episode {episode}, at "
+                        f"{span.start + step / self.fps:.3f} s: {len(times)} frames until {times[-1]:.3f} s, and "
+                        f"info.json says {self.fps:g} per second; download the dataset again"
+                    )
 
 
 @functools.cache
 def _hash_video(path: Path) -> str:
     return artifacts.hash_file(path)  # cached, since a video holds many episodes
-
-
-def _decode(span: Span, fps: float) -> Iterator[Frame]:
-    start = max(0.0, span.start - 0.5 / fps)  # ffmpeg gives the first frame that is not before this
-    try:
-        reader = imageio_ffmpeg.read_frames(
-            str(span.path),
-            input_params=["-ss", f"{start:.6f}"],
-            output_params=["-fps_mode", "passthrough", "-frames:v", str(span.n_frames)],
-        )
-        width, height = next(reader)["size"]
-        for frame in reader:
-            yield np.frombuffer(frame, np.uint8).reshape(height, width, 3)
-    except (OSError, RuntimeError, StopIteration) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise BadInput(f"{span.path} cannot be read as a video ({reason}); download the dataset again") from error
 
 
 def is_lerobot(folder: Path) -> bool:
@@ -141,7 +164,7 @@ def is_lerobot(folder: Path) -> bool:
 
 
 def open_lerobot(
-    root: Path, keys: Sequence[str], *, with_frames: bool = True
+    root: Path, keys: Sequence[str], *, with_frames: bool = True, skip_incomplete: bool = False
 ) -> tuple[ConvertedTrajectories, Videos | None]:
     """Open a LeRobot folder.
 
@@ -149,78 +172,41 @@ def open_lerobot(
         root: the folder.
         keys: features that are the frames, one per view; empty: the only video.
         with_frames: False where the frames are elsewhere.
+        skip_incomplete: leave out episodes without steps, and those whose files are missing; a `Notice` names them.
 
     Returns:
         The episodes; and their videos, None without any or without `with_frames`.
 
     Raises:
-        BadInput: another version, pyarrow is not installed, a file is missing, or the choice of videos is ambiguous.
+        BadInput: another version, pyarrow is not installed, a file is missing or damaged, a video does not show every
+            step, or the choice of videos is ambiguous.
     """
-    info = artifacts.read_json(root / INFO)
-    version = str(info.get("codebase_version"))
-    if not version.startswith("v3."):
-        raise BadInput(
-            f"{root} is a LeRobot dataset of version {version}, v3.0 is read; convert it with lerobot's own "
-            "convert_dataset_v21_to_v30"
-        )
-    try:
-        import pyarrow.parquet
-    except ImportError as error:
-        raise BadInput("LeRobot's parquet files need pyarrow: pip install 'zest-rl[lerobot]'") from error
     root = root.resolve()
-    try:
-        features, fps = info["features"], float(info["fps"])
-        videos = {name: 3 if f["dtype"] == "video" and not _is_depth(f) else None for name, f in features.items()}
-        views = choose_pictures(videos, keys, str(root)) if with_frames and (keys or any(videos.values())) else []
-        observed = tuple(
-            name
-            for name, facts in features.items()
-            if name.startswith("observation") and facts["dtype"] in _NUMBERS and len(facts["shape"]) <= 1
-        )
-        video_columns = [
-            f"videos/{view}/{part}" for view in views for part in ("chunk_index", "file_index", "from_timestamp")
-        ]
-        columns = ["episode_index", "length", "data/chunk_index", "data/file_index", *video_columns]
-        parts = [pyarrow.parquet.read_table(p, columns=columns) for p in sorted(root.glob("meta/episodes/*/*.parquet"))]
-        episodes = sorted((row for part in parts for row in part.to_pylist()), key=lambda row: row["episode_index"])
-        n_steps = tuple(int(row["length"]) for row in episodes)
-        if not episodes or len({row["episode_index"] for row in episodes}) < len(episodes):
-            raise BadInput(
-                f"{root}/meta/episodes must list every episode once, got {len(episodes)} rows; download it again"
-            )
-        by_file = groupby(episodes, lambda row: _path(info["data_path"], row, "data"))
-        files = tuple((file, tuple(row["episode_index"] for row in rows)) for file, rows in by_file)
-        spans = tuple(
-            tuple(
-                Span(
-                    root / _path(info["video_path"], row, f"videos/{view}", view),
-                    float(row[f"videos/{view}/from_timestamp"]),
-                    int(row["length"]),
+    info = Info.read(root)
+    views = info.choose_views(keys, root) if with_frames else []
+    columns = info.columns(root)
+    listed = complete_episodes(root, read_listing(root, info, views), skip_incomplete)
+    by_file = groupby(listed, lambda episode: episode.data)
+    files = tuple((file, tuple(episode.number for episode in episodes)) for file, episodes in by_file)
+    for path in {root / name for e in listed for name in (e.data, *(name for name, _ in e.videos))}:
+        check_file(path)
+    n_steps = tuple(episode.n_steps for episode in listed)
+    n_listed = Counter[str]()
+    for episode in listed:
+        n_listed[episode.data] += episode.n_steps
+    for file, n in n_listed.items():
+        with open_parquet(root / file, MAX_ROWS) as opened:
+            if opened.metadata.num_rows < n:
+                raise BadInput(
+                    f"{root / file} has {opened.metadata.num_rows} rows, but meta/episodes lists {n} of them; download "
+                    "the dataset again"
                 )
-                for view in views
-            )
-            for row in episodes
-        )
-    except (KeyError, OSError, pyarrow.ArrowException) as error:
-        raise BadInput(f"{root}/meta is not that of a LeRobot v3.0 dataset ({error}); download it again") from error
-    needed = {root / file for file, _ in files} | {span.path for episode in spans for span in episode}
-    missing = sorted(path.relative_to(root).as_posix() for path in needed if not path.is_file())
-    if missing:
-        raise BadInput(f"{root} lacks {missing[0]} ({len(missing)} files in all); download the dataset whole")
-    others = tuple(name for name in _OTHERS if name in features)
-    if "action" not in others:
-        raise BadInput(f"{root} has no feature 'action', got {', '.join(features)}")
     n_bytes = 4 * sum((root / file).stat().st_size for file, _ in files)  # parquet compresses by less than that
-    read = partial(read_episodes, root, files, n_steps, (*observed, *others))
-    trajectories = ConvertedTrajectories(root, "LeRobot", n_steps, n_bytes, read, fps)
-    return trajectories, Videos(tuple(views), fps, spans) if views else None
-
-
-def _path(template: str, row: Mapping[str, Any], where: str, video_key: str = "") -> str:
-    numbers = {f"{part}_index": row[f"{where}/{part}_index"] for part in ("chunk", "file")}
-    return template.format(video_key=video_key, **numbers)
-
-
-def _is_depth(facts: Mapping[str, Any]) -> bool:
-    info: Mapping[str, Any] = facts.get("info") or {}
-    return bool(info.get("is_depth_map") or info.get("video.is_depth_map"))
+    read = partial(read_episodes, root, files, n_steps, columns)
+    trajectories = ConvertedTrajectories(root, "LeRobot", n_steps, n_bytes, read, info.fps)
+    if not views:
+        return trajectories, None
+    spans = tuple(tuple(Span(root / name, start, e.n_steps) for name, start in e.videos) for e in listed)
+    videos = Videos(tuple(views), info.fps, spans)
+    videos.check([episode.number for episode in listed])
+    return trajectories, videos

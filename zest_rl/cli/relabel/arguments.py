@@ -46,6 +46,8 @@ class Config:
     """Keep the robot in view (the paper removes it)."""
     tolerance: float = 1e-3
     """States that agree to this many rad or m are rendered and embedded once; 0: only equal states."""
+    skip_incomplete: bool = False
+    """Leave out the episodes of a LeRobot folder that have no steps, or whose files were not downloaded."""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """Of the embedder; auto: bf16 where the hardware has it, fp32 for the default embedder."""
     device: str = "auto"

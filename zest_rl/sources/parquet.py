@@ -1,0 +1,83 @@
+"""Parquet files of other people: tables and columns of numbers, or an error that says what is wrong with which file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from zest_rl.errors import BadInput
+from zest_rl.runtime.files import check_file
+from zest_rl.types import FloatArray
+
+
+@contextmanager
+def open_parquet(path: Path, max_rows: int) -> Iterator[Any]:
+    """Open a file for as long as the context lasts; the context may read from it, and nothing else.
+
+    Args:
+        path: the file.
+        max_rows: more are refused by the header alone: a file of a few kB can unpack to terabytes.
+
+    Yields:
+        A `pyarrow.parquet.ParquetFile`.
+
+    Raises:
+        BadInput: the file is missing, damaged, a Git LFS pointer or too long; pyarrow is not installed.
+    """
+    try:
+        import pyarrow.parquet
+    except ImportError as error:
+        raise BadInput("LeRobot's parquet files need pyarrow: pip install 'zest-rl[lerobot]'") from error
+    check_file(path)
+    try:
+        with path.open("rb") as file:  # Arrow itself takes names in UTF-8 only, whatever the locale
+            opened = pyarrow.parquet.ParquetFile(file)
+            n_rows = opened.metadata.num_rows
+            if not 0 <= n_rows <= max_rows:
+                raise BadInput(f"{path} says that it has {n_rows} rows, at most {max_rows} are read; download it again")
+            yield opened
+    except BadInput:
+        raise
+    except Exception as error:  # on damaged files Arrow raises many kinds
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise BadInput(f"{path} cannot be read as parquet ({reason}); download it again") from error
+
+
+def read_table(path: Path, columns: Sequence[str], max_rows: int) -> Any:
+    """Read columns as a `pyarrow.Table`; arguments and errors as in `open_parquet`.
+
+    Raises:
+        BadInput: also if the file lacks a column.
+    """
+    with open_parquet(path, max_rows) as file:
+        names = file.schema_arrow.names
+        if missing := [name for name in columns if name not in names]:
+            raise BadInput(f"{path} has no column {missing[0]!r}, got {', '.join(names)[:300]}; download it again")
+        return file.read(columns=list(columns))
+
+
+def as_numbers(values: Any, what: str) -> FloatArray:
+    """Turn an Arrow column of T >= 1 numbers, or of equally long lists of them, into (T, n) float32.
+
+    Raises:
+        BadInput: values are missing, no numbers, or lists of different lengths; `what` names them.
+    """
+    import pyarrow.compute
+    import pyarrow.types
+
+    array: Any = values.combine_chunks()
+    flat = array.flatten() if hasattr(array.type, "value_type") else array
+    is_number = (pyarrow.types.is_integer, pyarrow.types.is_floating, pyarrow.types.is_boolean)
+    if not any(known(flat.type) for known in is_number):
+        raise BadInput(f"{what} must hold numbers or lists of them, got {array.type}; leave it out of info.json")
+    if array.null_count or flat.null_count:
+        row = pyarrow.compute.index(pyarrow.compute.is_null(array), True).as_py()
+        at = f"at step {row}" if array.null_count else "in a list"
+        raise BadInput(f"{what} has no value {at}; fill it, or leave out the episode")
+    if flat is not array and len(lengths := pyarrow.compute.list_value_length(array).unique()) > 1:
+        raise BadInput(f"{what} must hold equally long lists, got lengths {sorted(lengths.to_pylist())[:5]}")
+    return np.asarray(flat.to_numpy(zero_copy_only=False), np.float32).reshape(len(array), -1)
