@@ -173,6 +173,11 @@ def test_text_files_are_utf_8_whatever_the_locale(path: Path) -> None:
         reads = isinstance(call.func, ast.Attribute) and call.func.attr in ("read_text", "write_text")
         opens = name.endswith(".open") or name == "open"
         modes = [arg.value for arg in call.args if isinstance(arg, ast.Constant)]
-        in_bytes = any("b" in str(mode) for mode in modes) or name in ("os.open", "Image.open", "webbrowser.open")
+        in_bytes = any("b" in str(mode) for mode in modes) or name in (
+            "os.open",
+            "Image.open",
+            "webbrowser.open",
+            "h5d.open",
+        )
         if reads or (opens and not in_bytes):
             assert "encoding" in {keyword.arg for keyword in call.keywords}, ast.unparse(call)

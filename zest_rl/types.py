@@ -37,13 +37,19 @@ def _check_shape(what: str, array: NDArray[Any], shape: tuple[int | None, ...], 
         )
 
 
-def _check_finite(what: str, array: NDArray[Any]) -> None:
+def check_finite(what: str, array: NDArray[Any]) -> NDArray[Any]:
+    """Return an array (n, …) that holds numbers alone.
+
+    Raises:
+        BadInput: NaN or infinity, of which the first row is named.
+    """
     bad = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))
     if len(bad):
         raise BadInput(
             f"{what} must be finite, but {len(bad)} of {len(array)} rows hold NaN or infinity "
             f"(the first at index {bad[0]}); repair or drop the episode before using the dataset"
         )
+    return array
 
 
 @dataclass(frozen=True)
@@ -67,7 +73,7 @@ class Episode:
         _check_shape("actions", self.actions, (n_steps, None), np.float32)
         _check_shape("rewards", self.rewards, (n_steps,), np.float32)
         for what, array in (("obs", self.obs), ("actions", self.actions), ("rewards", self.rewards)):
-            _check_finite(what, array)
+            check_finite(what, array)
 
     def __len__(self) -> int:
         return len(self.actions)

@@ -65,7 +65,7 @@ def write(recordings: list[Recording], dataset_id: str = NEW, **changes: Any) ->
 def relabel(source: str, dataset_id: str = NEW, extra: Any = lambda staging: None) -> Path:
     rewards, scores = new_rewards(source)
     return write_scored(
-        copy_of(source), dataset_id, rewards, scores, description="And more.", zest={"relabel": {"a": 1}}, extra=extra
+        copy_of(source), dataset_id, rewards, scores, description="And more.", zest={"stage": {"a": 1}}, extra=extra
     )
 
 
@@ -226,7 +226,7 @@ def test_relabeling_changes_rewards_adds_scores_and_keeps_everything_else_bit_fo
     old, new = read(collected, lambda ds: ds.metadata), read(NEW, lambda ds: ds.metadata)
     assert new.pop("dataset_id") == NEW
     assert new.pop("description") == "a few episodes for tests And more."
-    assert new.pop("zest") == {**old.pop("zest"), "relabel": {"a": 1}}
+    assert new.pop("zest") == {**old.pop("zest"), "stage": {"a": 1}}
     assert new == {key: value for key, value in old.items() if key in new}
     assert old.keys() - new.keys() == {"dataset_id", "description"}
     assert read(NEW, Dataset.fingerprint) == read(collected, Dataset.fingerprint)
@@ -254,11 +254,11 @@ def test_relabeling_a_relabeled_dataset_replaces_its_scores(collected: str) -> N
         [z[1:] for z in zeros],
         zeros,
         description="",
-        zest={"relabel": {"a": 2}},
+        zest={"stage": {"a": 2}},
         extra=lambda staging: None,
     )
     np.testing.assert_array_equal(read("zest/again-v0", Dataset.scores), zeros)
-    assert read("zest/again-v0", lambda ds: ds.metadata)["zest"]["relabel"] == {"a": 2}
+    assert read("zest/again-v0", lambda ds: ds.metadata)["zest"]["stage"] == {"a": 2}
 
 
 @pytest.mark.parametrize(

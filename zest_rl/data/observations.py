@@ -19,6 +19,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.data.hdf5 import read_array
 from zest_rl.errors import BadInput
 from zest_rl.types import FloatArray, Frame
 
@@ -210,9 +211,7 @@ def numbers(node: h5py.Group | h5py.Dataset) -> FloatArray:
         BadInput: there are no numbers.
     """
     columns = [
-        np.asarray(entry[()], dtype=np.float32).reshape(len(entry), -1)
-        for entry in entries(node).values()
-        if is_numbers(entry)
+        read_array(entry, np.float32).reshape(len(entry), -1) for entry in entries(node).values() if is_numbers(entry)
     ]
     if not columns:
         raise BadInput(f"{node.name} holds pictures only; a policy here needs numbers to act on")

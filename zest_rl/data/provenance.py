@@ -7,16 +7,36 @@ and ``relabel`` (`RelabelRecord`). Fields that an earlier version did not write 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any, Literal, Self
+from dataclasses import dataclass, field
+from types import UnionType
+from typing import Any, Literal, Self, get_args, get_origin, get_type_hints
 
 from zest_rl.errors import BadInput
 
 
 def _field_values(record: type[Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values that a record has fields for."""
-    return {field.name: values[field.name] for field in fields(record) if field.name in values}
+    """Return the values that a record has fields for, each of the field's type."""
+    known = {name: (values[name], hint) for name, hint in get_type_hints(record).items() if name in values}
+    for name, (value, hint) in known.items():
+        if not _fits(value, hint):
+            raise TypeError(f"{name} must be {getattr(hint, '__name__', hint)}, got {value!r:.80}")
+    return {name: value for name, (value, _) in known.items()}
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a JSON value is of the type of a record's field, or what is made into it."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin is UnionType:
+        return any(_fits(value, part) for part in parts)
+    if origin is Literal:
+        return value in parts
+    if origin is tuple:
+        return isinstance(value, list | tuple) and all(_fits(item, parts[0]) for item in value)
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    return isinstance(value, origin or hint) and not (hint is int and isinstance(value, bool))
 
 
 @dataclass(frozen=True)
@@ -91,9 +111,11 @@ class RelabelRecord:
         """Read what `to_json` returned."""
         kept = values.get("kept_goals")
         scorer = ScorerRecord.from_json(values["scorer"])
-        return cls(
-            **{**_field_values(cls, values), "scorer": scorer, "kept_goals": None if kept is None else tuple(kept)}
-        )
+        made = {**values, "scorer": scorer, "kept_goals": None if kept is None else tuple(kept)}
+        record = cls(**_field_values(cls, made))
+        if record.n_views < 1:
+            raise ValueError("there must be 1 view or more, got 0")
+        return record
 
     @property
     def is_foreign(self) -> bool:
@@ -146,19 +168,23 @@ class DatasetRecord:
         Raises:
             BadInput: the record of a stage is not in our format.
         """
-        stages = metadata.get("zest") or {}
-        collect, relabel = stages.get("collect"), stages.get("relabel")
         try:
-            return cls(
-                id=dataset_id,
-                env_spec=metadata.get("env_spec"),
-                ref_min_score=metadata.get("ref_min_score"),
-                ref_max_score=metadata.get("ref_max_score"),
-                collect=CollectRecord(collect.get("asked", {}), collect.get("result", {})) if collect else None,
-                relabel=RelabelRecord.from_json(relabel) if relabel else None,
-                fps=stages.get("recorded", {}).get("fps"),
-            )
-        except (KeyError, TypeError, AttributeError) as error:
+            stages: dict[str, Mapping[str, Any]] = {
+                stage: dict(record) for stage, record in metadata.get("zest", {}).items()
+            }
+            collect, relabel = stages.get("collect"), stages.get("relabel")
+            made = {
+                "id": dataset_id,
+                **{name: metadata.get(name) for name in ("env_spec", "ref_min_score", "ref_max_score")},
+                "collect": CollectRecord(**_field_values(CollectRecord, collect)) if collect else None,
+                "relabel": RelabelRecord.from_json(relabel) if relabel else None,
+                "fps": stages.get("recorded", {}).get("fps"),
+            }
+            read = cls(**_field_values(cls, made))
+            if not isinstance(read.env, dict) or not isinstance(read.env.get("kwargs", {}), dict):
+                raise TypeError(f"env_spec must be an object with an object of kwargs, got {read.env_spec:.80}")
+            return read
+        except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
             raise BadInput(
                 f"the record of how {dataset_id} was made is not ours ({type(error).__name__}: {error}); make the "
                 "dataset again with this version"

@@ -20,9 +20,8 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -32,63 +31,24 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.data.env_specs import entry_points
+from zest_rl.data.folders import DATA_FILE, MANIFEST_FILE, METADATA_FILE, verified_metadata
+from zest_rl.data.folders import DATASET_ID as DATASET_ID
+from zest_rl.data.folders import dataset_path as dataset_path
+from zest_rl.data.folders import datasets_root as datasets_root
+from zest_rl.data.folders import exists as exists
+from zest_rl.data.folders import list_datasets as list_datasets
+from zest_rl.data.hdf5 import check_rows, mapped_errors, open_hdf5, read_array
 from zest_rl.data.observations import acts_discretely, entries, is_numbers, numbers, stored_rows
 from zest_rl.data.provenance import DatasetRecord
-from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
-from zest_rl.types import Episode, FloatArray, GroundTruth
+from zest_rl.types import Episode, FloatArray, GroundTruth, check_finite
 
-DATASET_ID = re.compile(r"(?:[A-Za-z0-9][\w.-]+/)*[A-Za-z0-9][\w.-]*-v\d+")
-DATA_FILE, METADATA_FILE, MANIFEST_FILE = "data/main_data.hdf5", "data/metadata.json", "zest_manifest.json"
 SOURCE_REWARD, SOURCE_SUCCESS = "infos/source/reward", "infos/source/success"
 """Original rewards and successes (T+1,) in a relabeled dataset of another environment."""
-_GT_REWARD = "infos/gt/reward"
-
-
-def datasets_root() -> Path:
-    """Minari's folder of local datasets: ``$MINARI_DATASETS_PATH``, else ``~/.minari/datasets``. Not created here."""
-    return artifacts.folder_of("MINARI_DATASETS_PATH")
-
-
-def dataset_path(dataset_id: str) -> Path:
-    """Return the folder of a dataset id, whether or not it exists.
-
-    Raises:
-        BadInput: the id is not of the form ``namespace/name-vN`` (so ``..`` cannot lead out of the root).
-    """
-    if not DATASET_ID.fullmatch(dataset_id) or ".." in dataset_id:
-        raise BadInput(
-            f"a dataset id must look like 'namespace/name-v0' (letters, digits, '.', '_', '-'; namespace of at least "
-            f"2 characters), got {dataset_id!r}"
-        )
-    return datasets_root() / dataset_id
-
-
-def list_datasets() -> list[str]:
-    """Return the ids of all complete datasets under the root, sorted."""
-    root = datasets_root()
-    return sorted(folder.relative_to(root).as_posix() for folder in _datasets_in(root))
-
-
-def _datasets_in(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
-    """Yield the datasets below a folder, links to folders included; `above`: the folders that led here."""
-    here = folder.resolve()
-    if here in above:  # a link that leads back
-        return
-    with suppress(OSError):  # no root yet, or a folder of somebody else
-        for entry in folder.iterdir():
-            if entry.name.startswith(".") or not entry.is_dir():
-                continue
-            if (entry / METADATA_FILE).exists():
-                yield entry
-            else:
-                yield from _datasets_in(entry, (*above, here))
-
-
-def exists(dataset_id: str) -> bool:
-    """Whether a complete dataset of this id is on disk."""
-    return (dataset_path(dataset_id) / METADATA_FILE).exists()
+SUCCESS = (SOURCE_SUCCESS, "infos/success", "infos/is_success")
+"""Success by step in datasets of other robots: relabeled LeRobot's; Adroit's and mazes'; Fetch's."""
+_GT_REWARD, _QPOS = "infos/gt/reward", "infos/state/qpos"
 
 
 @dataclass(frozen=True)
@@ -102,6 +62,8 @@ class Dataset:
     """The whole of ``metadata.json``; `record` is the typed part of it."""
     groups: Mapping[str, h5py.Group]
     """Episodes by their names in the HDF5 file, ``episode_0`` first; gone once the dataset is closed."""
+    lengths: Mapping[str, int]
+    """T of every episode, by the same names."""
 
     @cached_property
     def record(self) -> DatasetRecord:
@@ -126,44 +88,34 @@ class Dataset:
         Actions of several dimensions are flattened; those of a Discrete space, (T,), are read as (T, 1) if `discrete`.
 
         Raises:
-            BadInput: an episode without steps, lengths that do not fit, NaN, observations that are pictures alone,
+            BadInput: lengths that do not fit, NaN, observations that are pictures alone, episodes of unequal width,
                 discrete actions without `discrete`.
             ZestError: the file is damaged.
         """
 
         def read(group: h5py.Group) -> Episode:
-            ends = self._array(group, "terminations", bool)
             return Episode(
                 obs=self._observations(group),
                 actions=self._actions(group, discrete),
-                rewards=self._array(group, "rewards", np.float32),
-                terminated=bool(len(ends) and ends[-1]),
+                rewards=self._array(group, "rewards"),
+                terminated=self._is_terminated(group),
             )
 
-        return self._each(read)
+        episodes = self._each(read)
+        self._check_alike([(episode.obs.shape[1], episode.actions.shape[1]) for episode in episodes])
+        return episodes
 
     def n_steps(self) -> list[int]:
-        """Read T of every episode; rewards need not be recorded.
-
-        Raises:
-            BadInput: rewards of another length.
-        """
-
-        def read(group: h5py.Group) -> int:
-            n_steps = len(self._array(group, "terminations", bool))
-            if "rewards" in group and len(group["rewards"]) != n_steps:
-                raise BadInput(f"rewards must be as many as terminations, {n_steps}, got {len(group['rewards'])}")
-            return n_steps
-
-        return self._each(read)
+        """Return T of every episode."""
+        return list(self.lengths.values())
 
     def rewards(self) -> list[FloatArray]:
         """Read the rewards (T,) of every episode.
 
         Raises:
-            BadInput: there are none.
+            BadInput: there are none, or as in `episodes`.
         """
-        return self._arrays("rewards")
+        return self._each(lambda group: self._array(group, "rewards"))
 
     def states(self) -> list[NDArray[np.float64]]:
         """Read the simulator positions (T+1, nq) of every episode.
@@ -171,18 +123,26 @@ class Dataset:
         Raises:
             BadInput: no recorded state, lengths that do not fit, NaN.
         """
+        states = self._each(lambda group: self._array(group, _QPOS, np.float64, n_more=1, ndim=2))
+        self._check_alike([qpos.shape[1:] for qpos in states])
+        return states
 
-        def read(group: h5py.Group) -> NDArray[np.float64]:
-            qpos = self._array(group, "infos/state/qpos", np.float64)
-            n_steps = len(self._array(group, "rewards", np.float32))
-            if n_steps == 0:
-                raise BadInput("an episode must have at least 1 step, got 0; drop empty episodes from the dataset")
-            if qpos.ndim != 2 or len(qpos) != n_steps + 1:
-                raise BadInput(f"infos/state/qpos must have shape ({n_steps + 1}, nq), got {qpos.shape}")
-            if not np.isfinite(qpos).all():
-                raise BadInput("infos/state/qpos must be finite, got NaN or infinity; drop the episode")
-            return qpos
+    def successes(self) -> list[NDArray[np.bool_]] | None:
+        """Read the success (T,) after each action, by the names that other robots' datasets give it; None without any.
 
+        Raises:
+            BadInput: an episode holds other than T or, with the reset's, T+1 of them.
+        """
+
+        def read(group: h5py.Group) -> NDArray[np.bool_]:
+            name = next(name for name in SUCCESS if name in group)
+            n_steps = self.lengths[group.name.strip("/")]
+            n_more = int((getattr(group[name], "shape", None) or ())[:1] == (n_steps + 1,))
+            values = self._array(group, name, n_more=n_more, ndim=None)
+            return values[n_more:].reshape(n_steps, -1)[:, 0].astype(bool)
+
+        if not all(any(name in group for name in SUCCESS) for group in self.groups.values()):
+            return None
         return self._each(read)
 
     @property
@@ -198,8 +158,8 @@ class Dataset:
         """
         return self._each(
             lambda group: GroundTruth(
-                rewards=self._array(group, _GT_REWARD, np.float32)[1:],
-                success=bool(self._array(group, "infos/gt/success", bool).any()),
+                rewards=self._array(group, _GT_REWARD, n_more=1)[1:],
+                success=bool(self._array(group, "infos/gt/success", n_more=1).any()),
             )
         )
 
@@ -207,42 +167,55 @@ class Dataset:
         """Read the ZeST scores (T+1,) of every episode.
 
         Raises:
-            BadInput: the dataset was not relabeled.
+            BadInput: the dataset was not relabeled, or as in `episodes`.
         """
-        return self._arrays("infos/zest/score")
+        return self._each(lambda group: self._array(group, "infos/zest/score", n_more=1))
 
     def source_rewards(self) -> list[FloatArray] | None:
-        """Read the rewards (T,) that a dataset of another environment had before it was relabeled; None without any."""
+        """Read the rewards (T,) that a dataset of another environment had before it was relabeled; None without any.
+
+        They are its own: NaN stays where it had NaN.
+        """
         if not all(SOURCE_REWARD in group for group in self.groups.values()):
             return None
-        return [rewards[1:] for rewards in self._arrays(SOURCE_REWARD)]
+        return self._each(lambda group: self._array(group, SOURCE_REWARD, n_more=1, finite=False)[1:])
 
     def rewards_to_keep(self) -> list[FloatArray | None]:
-        """Read the original rewards (T,) that a relabeled copy keeps; None for ground truth, or if there are none."""
+        """Read the original rewards (T,) that a relabeled copy keeps, NaN included; None for ground truth or none."""
 
         def read(group: h5py.Group) -> FloatArray | None:
             if _GT_REWARD in group:
                 return None
             if SOURCE_REWARD in group:
-                return self._array(group, SOURCE_REWARD, np.float32)[1:]
-            return self._array(group, "rewards", np.float32) if "rewards" in group else None
+                return self._array(group, SOURCE_REWARD, n_more=1, finite=False)[1:]
+            return self._array(group, "rewards", finite=False) if "rewards" in group else None
 
         return self._each(read)
 
     def fingerprint(self) -> str:
-        """Hash everything that relabeling and training may see, except rewards: observations, actions, ends, states."""
+        """Hash everything that relabeling and training may see, except rewards: observations, actions, ends, states.
+
+        Raises:
+            BadInput: as in `episodes`, but observations may be pictures alone, and actions discrete.
+        """
+        widths: list[object] = []
 
         def digest(group: h5py.Group) -> str:
-            if "observations" not in group:
-                raise BadInput(f"dataset {self.id} has no 'observations' in {group.name}")
-            actions = self._array(group, "actions", np.float32)
-            ends = self._array(group, "terminations", bool)
-            arrays = [actions, np.array([bool(len(ends) and ends[-1])])]
-            if "infos/state/qpos" in group:
-                arrays.append(self._array(group, "infos/state/qpos", np.float64))
-            return artifacts.hash_stream(itertools.chain(_observation_parts(group["observations"]), arrays))
+            observed = self._observed(group)
+            numeric = {path: entry for path, entry in observed.items() if is_numbers(entry)}
+            widths.append({path: entry.shape[1:] for path, entry in numeric.items()})
+            arrays = [self._array(group, "actions", ndim=None), np.array([self._is_terminated(group)])]
+            if _QPOS in group:
+                arrays.append(read_array(group[_QPOS], np.float64))
+            parts = (
+                [check_finite(path, read_array(entry, np.float32))] if path in numeric else stored_rows(entry)
+                for path, entry in observed.items()
+            )
+            return artifacts.hash_stream(itertools.chain(*parts, arrays))
 
-        return artifacts.hash_json(self._each(digest))
+        digests = self._each(digest)
+        self._check_alike(widths)
+        return artifacts.hash_json(digests)
 
     def describe(self) -> dict[str, Any]:
         """Identity, environment, scale and provenance, JSON-ready, for the ``meta.json`` of a policy trained on it.
@@ -289,64 +262,79 @@ class Dataset:
     def _each(self, read: Callable[[h5py.Group], Any]) -> list[Any]:
         results = []
         for name, group in self.groups.items():
-            try:
-                results.append(read(group))
-            except BadInput as error:
-                raise BadInput(f"{name} of dataset {self.id}: {error}") from error
-            except OSError as error:
-                raise ZestError(f"{name} of dataset {self.id} is damaged ({error}); make it again") from error
+            what = f"{name} of dataset {self.id}"
+            with mapped_errors(what):
+                try:
+                    results.append(read(group))
+                except BadInput as error:
+                    raise BadInput(f"{what}: {error}") from error
         return results
 
-    def _arrays(self, name: str) -> list[FloatArray]:
-        return self._each(lambda group: self._array(group, name, np.float32))
+    def _check_alike(self, widths: Sequence[object]) -> None:
+        """Refuse episodes whose numbers are not those of the first."""
+        for name, width in zip(self.groups, widths, strict=True):
+            if width != widths[0]:
+                raise BadInput(
+                    f"the episodes of dataset {self.id} must hold equally many numbers, got {widths[0]} in episode_0 "
+                    f"and {width} in {name}; repair or drop it. Where floats may be pictures or numbers, declare "
+                    "bounds in the observation space: pictures are in [0, 1]"
+                )
 
-    def _array(self, group: h5py.Group, name: str, dtype: type) -> NDArray[Any]:
+    def _member(self, group: h5py.Group, name: str) -> Any:
         if name not in group:
             raise BadInput(
                 f"dataset {self.id} has no {name!r} in {group.name}; record it when the dataset is made "
                 "(zest_rl.data.reader describes the layout)"
             )
-        node = group[name]
+        return group[name]
+
+    def _array(
+        self,
+        group: h5py.Group,
+        name: str,
+        dtype: type = np.float32,
+        *,
+        n_more: int = 0,
+        ndim: int | None = 1,
+        finite: bool = True,
+    ) -> NDArray[Any]:
+        """Read an array of T + `n_more` rows of numbers, of any number of dimensions if `ndim` is None."""
+        node = self._member(group, name)
         if not isinstance(node, h5py.Dataset):
             raise BadInput(f"{name!r} in {group.name} of dataset {self.id} must be one flat array, got a group")
-        return np.asarray(node[()], dtype=dtype)
+        self._check_rows(name, node, n_more)
+        if ndim is not None and node.ndim != ndim:
+            raise BadInput(f"{name} must have {ndim} dimensions, got shape {node.shape}; repair or drop the episode")
+        values = read_array(node, dtype)
+        return check_finite(name, values) if finite else values
+
+    def _check_rows(self, name: str, node: h5py.Dataset, n_more: int) -> None:
+        check_rows(name, node, self.lengths[node.name.split("/")[1]], n_more)
+
+    def _is_terminated(self, group: h5py.Group) -> bool:
+        return bool(self._array(group, "terminations")[-1])
+
+    def _observed(self, group: h5py.Group) -> dict[str, h5py.Dataset]:
+        """Return the entries of the observations by their paths, of T + 1 rows each, before they are read."""
+        observed = entries(self._member(group, "observations"), "observations")
+        for path, entry in observed.items():
+            self._check_rows(path, entry, 1)
+        return observed
 
     def _observations(self, group: h5py.Group) -> FloatArray:
-        node = group.get("observations")
-        if isinstance(node, h5py.Group) or (node is not None and node.ndim != 2):
-            return numbers(node)
-        return self._array(group, "observations", np.float32)
+        observed = self._observed(group)
+        if list(observed) == ["observations"] and observed["observations"].ndim == 2:
+            return read_array(observed["observations"], np.float32)
+        return numbers(group["observations"])
 
     def _actions(self, group: h5py.Group, discrete: bool) -> FloatArray:
-        actions = self._array(group, "actions", np.float32)
+        actions = self._array(group, "actions", ndim=None)
         is_discrete = acts_discretely(group)
         if is_discrete and not discrete:
             raise BadInput("its actions are discrete, a policy here acts by continuous ones; `zest export` takes them")
         return (
             actions.reshape(len(actions), math.prod(actions.shape[1:])) if actions.ndim > 1 or is_discrete else actions
         )
-
-
-def _verified_metadata(dataset_id: str, folder: Path) -> dict[str, Any]:
-    """Return a dataset's metadata after comparing its files with their hashes; raises as `open_dataset`."""
-    if not exists(dataset_id):
-        raise BadInput(
-            f"there is no dataset {dataset_id!r} under the Minari root; {nearest(dataset_id, list_datasets())}. "
-            "Make one with `zest collect`, or set MINARI_DATASETS_PATH to the folder that holds it"
-        )
-    if (folder / MANIFEST_FILE).exists():
-        for name, digest in artifacts.read_json(folder / MANIFEST_FILE).items():
-            path = folder / name
-            if not path.exists() or artifacts.hash_file(path) != digest:
-                raise ZestError(
-                    f"{name} of dataset {dataset_id} is missing or was changed since it was written; make the dataset "
-                    f"again, or, if you changed it on purpose, delete its {MANIFEST_FILE}"
-                )
-    metadata: dict[str, Any] = artifacts.read_json(folder / METADATA_FILE)
-    for key in ("env_spec", "eval_env_spec"):
-        if metadata.get(key):
-            entry_points(metadata[key], f"the {key} of dataset {dataset_id}")
-    return metadata
 
 
 @contextmanager
@@ -356,32 +344,44 @@ def open_dataset(dataset_id: str) -> Iterator[Dataset]:
     Reading runs no code; before an environment is built from the env_spec, `zest_rl.data.env_specs` must check it.
 
     Raises:
-        BadInput: no such dataset (the nearest ids are named), an invalid env_spec, a storage other than HDF5, or
-            missing episodes.
+        BadInput: no such dataset (the nearest ids are named), a file that is a link or is of another kind, metadata
+            that break a rule or do not agree with the arrays, a storage other than HDF5, data outside the file
+            (`zest_rl.data.hdf5`), or missing episodes.
         ZestError: a file is damaged or was changed since it was written.
     """
-    path = dataset_path(dataset_id)
-    metadata = _verified_metadata(dataset_id, path)
-    try:
-        file = h5py.File(path / DATA_FILE, "r")
-    except OSError as error:
-        raise BadInput(f"dataset {dataset_id} cannot be read as HDF5 ({error}); only that storage is read") from error
-    with file:
+    path, what = dataset_path(dataset_id), f"dataset {dataset_id}"
+    metadata = verified_metadata(dataset_id)
+    if not (path / DATA_FILE).exists():
+        raise BadInput(f"{what} cannot be read as HDF5 (it has no {DATA_FILE}); only that storage is read")
+    with open_hdf5(path / DATA_FILE, what) as file:
         names = [f"episode_{i}" for i in range(len(file))]
         if not names:
-            raise BadInput(f"dataset {dataset_id} has no episodes; collect it again")
+            raise BadInput(f"{what} has no episodes; collect it again")
         if missing := [name for name in names if name not in file]:
             raise BadInput(
-                f"dataset {dataset_id} must hold {names[0]}, … {names[-1]}, as Minari needs it, but {missing[0]} "
-                f"is missing from its {len(file)} groups; rename them, and set total_episodes in metadata.json"
+                f"{what} must hold {names[0]}, … {names[-1]}, as Minari needs it, but {missing[0]} is missing from its "
+                f"{len(file)} groups; rename them, and set total_episodes in metadata.json"
             )
-        yield Dataset(dataset_id, path, metadata, {name: file[name] for name in names})
+        groups = {name: file[name] for name in names}
+        lengths = {name: _n_steps(group, what) for name, group in groups.items()}
+        for key, n in (("total_episodes", len(names)), ("total_steps", sum(lengths.values()))):
+            if metadata.get(key, n) != n:
+                raise BadInput(
+                    f"{METADATA_FILE} of {what} has {key} {metadata[key]}, but {DATA_FILE} holds {n}: one of them is "
+                    f"not whole. Download or make the dataset again; or, if you changed it on purpose, correct {key}"
+                )
+        ds = Dataset(dataset_id, path, metadata, groups, lengths)
+        _ = ds.record  # which refuses metadata that are not ours
+        yield ds
 
 
-def _observation_parts(node: h5py.Group | h5py.Dataset) -> Iterator[NDArray[Any]]:
-    """Yield an episode's observations in parts: raw pictures, a few steps at a time, and numbers as float32."""
-    for entry in entries(node).values():
-        if is_numbers(entry):
-            yield np.asarray(entry[()], dtype=np.float32)
-        else:
-            yield from stored_rows(entry)
+def _n_steps(group: Any, what: str) -> int:
+    """Return T of an episode."""
+    ends = group.get("terminations") if isinstance(group, h5py.Group) else None
+    if not isinstance(ends, h5py.Dataset) or len(ends.shape or ()) != 1:
+        raise BadInput(
+            f"{what} has no 'terminations' in {group.name}, one per step; record it when the dataset is made"
+        )
+    if not len(ends):
+        raise BadInput(f"{what}: {group.name} must have at least 1 step, got 0; drop empty episodes from the dataset")
+    return len(ends)

@@ -20,15 +20,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.data.reader import (
-    DATA_FILE,
-    MANIFEST_FILE,
-    METADATA_FILE,
-    SOURCE_REWARD,
-    Dataset,
-    dataset_path,
-    exists,
-)
+from zest_rl.data.folders import DATA_FILE, MANIFEST_FILE, METADATA_FILE, dataset_path, exists
+from zest_rl.data.hdf5 import open_hdf5
+from zest_rl.data.reader import SOURCE_REWARD, Dataset
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.parallel import die_with_parent, starting_children
@@ -295,6 +289,8 @@ class DatasetCopy:
 
 def _build_scored(trajectories: Trajectories, folder: Path, scored: Sequence[Mapping[str, FloatArray]]) -> None:
     trajectories.fill(folder)
+    with open_hdf5(folder / DATA_FILE):
+        pass  # nothing in it leads to another file, so that writing to it changes it alone
     with h5py.File(folder / DATA_FILE, "r+") as file:
         for i, arrays in enumerate(scored):
             group = file[f"episode_{i}"]

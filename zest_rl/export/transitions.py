@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from zest_rl.data.observations import acts_discretely, entries, is_numbers
 from zest_rl.data.provenance import DatasetRecord
-from zest_rl.data.reader import SOURCE_SUCCESS, Dataset, open_dataset
+from zest_rl.data.reader import Dataset, open_dataset
 from zest_rl.errors import BadInput, nearest
 from zest_rl.types import FloatArray
 
@@ -24,8 +24,6 @@ Shape = Literal["step", "difference", "terminal"]
 """The rewards as they are, their change, or the last one alone and 0 before."""
 Transitions = dict[str, NDArray[Any]]
 """Equally long arrays of one episode, see `transitions`."""
-SUCCESS = (SOURCE_SUCCESS, "infos/success", "infos/is_success")
-"""Success by step in datasets of other robots: relabeled LeRobot's; Adroit's and mazes'; Fetch's."""
 
 
 @dataclass(frozen=True)
@@ -137,14 +135,7 @@ def read_transitions(ds: Dataset, shape: Shape = "step", normalise: bool = False
         truth = ds.truth()
         columns["gt_reward"] = [episode.rewards for episode in truth]
         columns["gt_episode_success"] = [np.full(len(episode.rewards), episode.success) for episode in truth]
-    widths = sorted({episode.obs.shape[1] for episode in episodes})
-    if len(widths) > 1:
-        raise BadInput(
-            f"the episodes of {ds.id} must observe equally many numbers, got {widths}; where floats may be "
-            "pictures or numbers, declare bounds in the observation space: pictures are in [0, 1]"
-        )
-    success = [after for after in map(_success, groups) if after is not None]
-    if len(success) == len(groups):
+    if (success := ds.successes()) is not None:
         columns["success"] = success
     rewards = shape_rewards([episode.rewards for episode in episodes], before, shape, normalise)
     actions = [_as_stored(episode.actions, groups[0]) for episode in episodes]
@@ -196,12 +187,3 @@ def _as_stored(actions: FloatArray, episode: h5py.Group) -> NDArray[Any]:
     if not acts_discretely(episode):
         return actions
     return (actions[:, 0] if episode["actions"].ndim == 1 else actions).astype(np.int64)
-
-
-def _success(episode: h5py.Group) -> NDArray[np.bool_] | None:
-    """Read success after each action: (T,); None where it is not recorded."""
-    path = next((path for path in SUCCESS if path in episode), None)
-    n_steps = len(episode["actions"])
-    if path is None or len(episode[path]) not in (n_steps, n_steps + 1):
-        return None
-    return np.asarray(episode[path][-n_steps:], dtype=bool).reshape(n_steps, -1)[:, 0]

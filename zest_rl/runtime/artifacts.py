@@ -201,7 +201,7 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ZestError(f"{path} does not exist; was the stage before this one run to its end?") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ZestError(f"{path} cannot be read as JSON: {error}") from error
 
 

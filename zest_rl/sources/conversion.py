@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.data.reader import METADATA_FILE, SOURCE_SUCCESS
+from zest_rl.data.folders import METADATA_FILE
+from zest_rl.data.reader import SOURCE_SUCCESS
 from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
-from zest_rl.types import FloatArray
+from zest_rl.types import FloatArray, check_finite
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ class ConvertedEpisode:
                 f"{self.actions.shape}, rewards {self.rewards.shape}"
                 + (f", and {wrong[0]} of {self.obs[wrong[0]].shape}" if wrong else "")
             )
+        for name, values in {**self.obs, "actions": self.actions}.items():
+            check_finite(name, values)
         if not self.obs:
             raise BadInput("an episode must hold numbers among its observations, for a policy to act on; got none")
 
@@ -65,7 +68,7 @@ class ConvertedTrajectories:
     def dataset_id(self) -> str:
         """``zest/NAME-v0``, from the name of the file or folder."""
         name = self.path.stem if self.path.is_file() else self.path.name
-        return f"zest/{re.sub(r'[^A-Za-z0-9_.]+', '-', name).strip('-._') or 'dataset'}-v0"
+        return f"zest/{re.sub(r'[^A-Za-z0-9_.]+|[.]{2,}', '-', name).strip('-._') or 'dataset'}-v0"
 
     def fingerprint(self) -> str:
         """Hash everything that training may see, except rewards, and what else the copy keeps: success and `fps`."""

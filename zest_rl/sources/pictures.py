@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
-
+from zest_rl.data.hdf5 import open_hdf5
 from zest_rl.data.observations import ROWS, entries, n_channels, read_pictures, stored_rows
 from zest_rl.runtime import artifacts
 from zest_rl.types import Frame
@@ -32,7 +31,7 @@ class Pictures:
 
     def digest(self, episode: int) -> str:
         """Hash the stored rows."""
-        with h5py.File(self.file, "r") as file:
+        with open_hdf5(self.file) as file:
             group = file[self.episodes[episode]]
             parts = (part for view in self.views for part in stored_rows(group[view]))
             lasts = (group[last][-1:] for last in self.lasts)
@@ -40,7 +39,7 @@ class Pictures:
 
     def read(self, episode: int) -> Iterator[Sequence[Frame]]:
         """Yield the views of each step."""
-        with h5py.File(self.file, "r") as file:
+        with open_hdf5(self.file) as file:
             group = file[self.episodes[episode]]
             for start in range(0, len(group[self.views[0]]), ROWS):
                 rows = slice(start, start + ROWS)
@@ -51,5 +50,5 @@ class Pictures:
 
 def picture_entries(file: Path, group: str) -> dict[str, int | None]:
     """Return the `n_channels` of all entries below a group."""
-    with h5py.File(file, "r") as opened:
+    with open_hdf5(file) as opened:
         return {name: n_channels(entry) for name, entry in entries(opened[group]).items()}

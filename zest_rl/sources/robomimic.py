@@ -7,42 +7,129 @@ its ``terminals`` is 1, which `zest export` records; without these, of its ``don
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
 import h5py
 import numpy as np
 
+from zest_rl.data.hdf5 import check_rows, mapped_errors, open_hdf5, read_array
 from zest_rl.data.observations import choose_pictures, entries, is_numbers
-from zest_rl.errors import BadInput
+from zest_rl.errors import BadInput, Notice
 from zest_rl.sources.conversion import ConvertedEpisode, ConvertedTrajectories
 from zest_rl.sources.pictures import Pictures, picture_entries
 from zest_rl.types import FloatArray
 
 
 def read_episodes(path: Path, names: Sequence[str]) -> Iterator[ConvertedEpisode]:
-    """Read one episode at a time, from groups such as ``data/demo_0``."""
-    with h5py.File(path, "r") as file:
+    """Read one episode at a time, from groups such as ``data/demo_0``.
+
+    Raises:
+        BadInput: an episode that breaks a rule, or has other numbers than the first; the message names it.
+    """
+    first: dict[str, int] = {}
+    with open_hdf5(path) as file:
         for name in names:
-            yield _read(file[name])
+            with _named(name, path):
+                episode = _read(file[name])
+                widths = {
+                    **{f"obs/{key}": v.shape[1] for key, v in episode.obs.items()},
+                    "actions": episode.actions.shape[1],
+                }
+                first = first or widths
+                if widths != first:
+                    raise BadInput(
+                        f"every demo must hold the same numbers; {_difference(widths, first)} in {names[0]}; repair it"
+                    )
+            yield episode
+
+
+@contextmanager
+def _named(name: str, path: Path) -> Iterator[None]:
+    try:
+        with mapped_errors(f"{name} of {path}"):
+            yield
+    except BadInput as error:
+        raise BadInput(
+            f"{name} of {path.name}: {error}. To drop it: "
+            f"""`python -c "import h5py; del h5py.File('{path.name}', 'r+')['{name}']"`"""
+        ) from error
+
+
+def _demos(file: h5py.File, path: Path) -> list[str]:
+    """Return the groups of all demos that have steps, in order; says which have none, as failed takes of Isaac Lab."""
+    data = file.get("data")
+    members = list(data) if isinstance(data, h5py.Group) else []
+    demos = [name for name in members if name.startswith("demo_")]
+    if misnamed := [name for name in demos or members if not name.removeprefix("demo_").isdecimal()]:
+        raise BadInput(
+            f"episodes must be named data/demo_0, data/demo_1, …, got data/{misnamed[0]} in {path}; rename them: "
+            f"""`python -c "import h5py; d = h5py.File('{path.name}', 'r+')['data']; """
+            """[d.move(name, f'demo_{i}') for i, name in enumerate(list(d))]"`"""
+        )
+    names = [f"data/{name}" for name in sorted(demos, key=lambda name: int(name.removeprefix("demo_")))]
+    lengths = {name: _length(file[name]) for name in names}
+    empty, names = [name for name in names if lengths[name] == 0], [name for name in names if lengths[name] != 0]
+    incomplete = [name for name in names if lengths[name] is None or "obs" not in file[name]]
+    if not names or incomplete:
+        raise BadInput(
+            f"{path} must hold data/demo_0, … with actions and obs/, as robomimic's files do; "
+            + (f"{incomplete[0]} lacks one of them (extract observations first)" if incomplete else "it has none")
+        )
+    if empty:
+        warnings.warn(f"left out, as they have no steps: {', '.join(empty)}", Notice, stacklevel=2)
+    return names
+
+
+def _length(demo: h5py.Group | h5py.Dataset) -> int | None:
+    """Return T; None where there are no actions beside other arrays."""
+    if not isinstance(demo, h5py.Group):
+        return None
+    actions = demo.get("actions")
+    if isinstance(actions, h5py.Dataset) and actions.shape:
+        return int(actions.shape[0])
+    return None if len(demo) else 0
+
+
+def _difference(widths: dict[str, int], first: dict[str, int]) -> str:
+    """Say where the numbers of a demo are not those of the first."""
+    key = next(key for key in {**first, **widths} if widths.get(key) != first.get(key))
+    return f"{key} has {widths.get(key, 'none')} per step here, but {first.get(key, 'none')}"
+
+
+def _arrays(demo: h5py.Group) -> dict[str, h5py.Dataset]:
+    """Return the arrays of a demo that count, by their paths: T rows each. None is read."""
+    parts, n_steps = ("actions", "rewards", "terminals", "dones", "obs", "next_obs"), _length(demo) or 0
+    arrays = {path: entry for part in parts if part in demo for path, entry in entries(demo[part], part).items()}
+    for path, entry in arrays.items():
+        check_rows(path, entry, n_steps)
+        before = arrays.get(path.removeprefix("next_"), entry)
+        if entry.shape != before.shape:
+            raise BadInput(f"{path} must have the shape of {before.name}, {before.shape}, got {entry.shape}")
+    return arrays
 
 
 def _read(demo: h5py.Group) -> ConvertedEpisode:
-    actions = np.asarray(demo["actions"][()], np.float32)
-    rewards = np.asarray(demo["rewards"][()], np.float32) if "rewards" in demo else np.full(len(actions), np.nan, "f4")
+    arrays = _arrays(demo)
+    actions = read_array(arrays["actions"], np.float32)
+    rewards = read_array(arrays["rewards"], np.float32) if "rewards" in arrays else np.full(len(actions), np.nan, "f4")
     obs = {}
-    for path, entry in entries(demo["obs"]).items():
-        if is_numbers(entry):
-            rows: FloatArray = np.asarray(entry[()], np.float32).reshape(len(entry), -1)
-            after = demo.get(f"next_obs/{path}")
-            last = rows[-1:] if after is None else np.asarray(after[-1:], np.float32).reshape(1, -1)
-            obs[path.replace("/", ".")] = np.concatenate([rows, last])
-    ends = next((np.asarray(demo[name][()]) for name in ("terminals", "dones") if name in demo), np.zeros(1))
-    try:
-        return ConvertedEpisode(obs, actions, rewards, bool(len(ends) and ends[-1]))
-    except BadInput as error:
-        raise BadInput(f"{demo.name}: {error}") from error
+    for path, entry in arrays.items():
+        if path.startswith("obs") and is_numbers(entry):
+            rows: FloatArray = read_array(entry, np.float32).reshape(len(entry), -1)
+            after = arrays.get(f"next_{path}")
+            last = rows[-1:] if after is None else read_array(after, np.float32)[-1:].reshape(1, -1)
+            obs[path.removeprefix("obs/").replace("/", ".")] = np.concatenate([rows, last])
+    ends = next((arrays[name] for name in ("terminals", "dones") if name in arrays), None)
+    return ConvertedEpisode(
+        obs,
+        actions,
+        rewards[:, 0] if rewards.shape[1:] == (1,) else rewards,
+        terminated=ends is not None and bool(read_array(ends, np.float32)[-1].any()),
+    )
 
 
 def open_robomimic(
@@ -61,37 +148,21 @@ def open_robomimic(
     Raises:
         BadInput: another kind of file, no demos, or the choice of pictures is ambiguous.
     """
-    try:
-        with h5py.File(path, "r") as file:
-            demos = file.get("data")
-            members = [name for name in demos if name.startswith("demo_")] if isinstance(demos, h5py.Group) else []
-            misnamed = [name for name in members if not name.removeprefix("demo_").isdecimal()]
-            if misnamed:
-                raise BadInput(f"episodes must be named data/demo_0, data/demo_1, …, got data/{misnamed[0]} in {path}")
-            names = [f"data/{name}" for name in sorted(members, key=lambda name: int(name.removeprefix("demo_")))]
-            incomplete = [name for name in names if "actions" not in file[name] or "obs" not in file[name]]
-            if not names or incomplete:
-                raise BadInput(
-                    f"{path} must hold data/demo_0, … with actions and obs/, as robomimic's files do; "
-                    + (
-                        f"{incomplete[0]} lacks one of them (extract observations first)"
-                        if incomplete
-                        else "it has none"
-                    )
-                )
-            n_steps = tuple(len(file[name]["actions"]) for name in names)
-            numbers = [e for e in entries(file[names[0]]["obs"]).values() if is_numbers(e)]
-            n_bytes = 4 * sum(n_steps) * (32 + sum(int(np.prod(e.shape[1:])) for e in numbers))
-    except OSError as error:
-        raise BadInput(f"{path} cannot be read as HDF5 ({error}); relabel takes robomimic's files") from error
+    with open_hdf5(path) as file:
+        names, n_steps = _demos(file, path), []
+        for name in names:
+            with _named(name, path):
+                n_steps.append(len(_arrays(file[name])["actions"]))
+        numbers = [entry for entry in entries(file[names[0]]["obs"]).values() if is_numbers(entry)]
+        n_bytes = 4 * sum(n_steps) * (32 + sum(int(np.prod(entry.shape[1:])) for entry in numbers))
     pictures = picture_entries(path, f"{names[0]}/obs")
     read = partial(read_episodes, path.resolve(), names)
-    trajectories = ConvertedTrajectories(path.resolve(), "robomimic", n_steps, n_bytes, read)
+    trajectories = ConvertedTrajectories(path.resolve(), "robomimic", tuple(n_steps), n_bytes, read)
     if not with_frames or not (keys or any(pictures.values())):
         return trajectories, None
     chosen = choose_pictures(pictures, keys, str(path), "obs")
     after = tuple(f"next_obs/{key}" for key in chosen)
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         has_last = all(key in file[name] for key in after for name in names)
     views = tuple(f"obs/{key}" for key in chosen)
     return trajectories, Pictures(path.resolve(), tuple(names), views, after if has_last else ())

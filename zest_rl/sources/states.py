@@ -19,13 +19,14 @@ import h5py
 import numpy as np
 
 from zest_rl.data.env_specs import check_env_spec
+from zest_rl.data.hdf5 import check_rows, open_hdf5, read_array
 from zest_rl.data.observations import entries
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.sources import state_plugins
 from zest_rl.sources.recorded_envs import Columns, Doubles, RecordedEnv, recorded_env
 from zest_rl.sources.stage import SIZE, Pose, stage_of
-from zest_rl.types import Frame
+from zest_rl.types import Frame, check_finite
 
 _VERSION = 2  # raise it when a pixel changes, here or in stage.py: cached embeddings depend on it
 _DEFAULT_CAMERA = "the environment's own camera"
@@ -85,13 +86,13 @@ class States:
 
     def read_states(self, episode: int) -> dict[str, Doubles]:
         """Read ``qpos`` (T+1, nq), and everything else in the scene (T+1, n) by the last part of its path."""
-        with h5py.File(self.file, "r") as file:
+        with open_hdf5(self.file) as file:
             group = file[self.episodes[episode]]
-            n_rows = len(group["actions"]) + 1
-            states = {path.rpartition("/")[2]: _rows(group, path, n_rows) for path in self.scenery}
+            n_states = len(group["actions"]) + 1
+            states = {path.rpartition("/")[2]: _rows(group, path, n_states) for path in self.scenery}
             if not self.qpos:
-                return {**states, "qpos": state_plugins.rebuild(self._plugin, group, n_rows)}
-            columns = [_rows(group, path, n_rows)[:, first:end] for path, first, end in self.qpos]
+                return {**states, "qpos": state_plugins.rebuild(self._plugin, group, n_states)}
+            columns = [_rows(group, path, n_states)[:, first:end] for path, first, end in self.qpos]
             return {**states, "qpos": np.concatenate(columns, axis=1)}
 
     @property
@@ -102,15 +103,12 @@ class States:
         return entry
 
 
-def _rows(group: h5py.Group, path: str, n_rows: int) -> Doubles:
-    if path not in group:
+def _rows(group: h5py.Group, path: str, n_states: int) -> Doubles:
+    if not isinstance(group.get(path), h5py.Dataset):
         raise BadInput(f"{group.name} has no {path!r}, which its frames are rendered from; record it, or give --frames")
-    values = np.asarray(group[path][()], dtype=np.float64)
-    if len(values) != n_rows:
-        raise BadInput(f"{group.name}/{path} must have T + 1 = {n_rows} rows, one per observation, got {len(values)}")
-    if not np.isfinite(values).all():
-        raise BadInput(f"{group.name}/{path} must be finite, got NaN or infinity; drop the episode")
-    return values.reshape(n_rows, -1)
+    name = f"{group.name}/{path}"
+    check_rows(name, group[path], n_states - 1, 1)
+    return check_finite(name, read_array(group[path], np.float64)).reshape(n_states, -1)
 
 
 def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, cameras: Sequence[str], what: str) -> States:
@@ -137,7 +135,7 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
     if plugin is None:
         check_env_spec(env_spec, f"the env_spec of {what}", "give --frames FOLDER with a video of each episode")
     row = recorded_env(str(spec["entry_point"]))
-    with h5py.File(file, "r") as opened:
+    with open_hdf5(file) as opened:
         group = opened[episodes[0]]
         infos = entries(group["infos"], "infos") if "infos" in group else {}
         recorded = [path for path in infos if path.rpartition("/")[2] == "qpos"]
