@@ -75,7 +75,7 @@ def read_array(node: h5py.Dataset, dtype: type) -> NDArray[Any]:
     """
     if node.dtype.kind not in "biuf":
         raise BadInput(f"{node.name} must hold numbers, got values of type {node.dtype}; store numbers")
-    _check_size(node)
+    check_stored(node)
     with np.errstate(over="ignore"):  # of float64 that float32 cannot hold: infinity, which is refused by name
         return np.asarray(node[()], dtype=dtype)
 
@@ -91,10 +91,11 @@ def check_rows(name: str, node: h5py.Dataset, n_steps: int, n_more: int = 0) -> 
         raise BadInput(
             f"{name} must have {wanted} = {n_steps + n_more} rows, got shape {node.shape}; repair or drop the episode"
         )
-    _check_size(node)
+    check_stored(node)
 
 
-def _check_size(node: h5py.Dataset) -> None:
+def check_stored(node: h5py.Dataset) -> None:
+    """Raise `BadInput` if an array is larger than what is stored of it can be."""
     if node.nbytes > _FREE and node.nbytes > MAX_RATIO * node.id.get_storage_size():
         raise BadInput(
             f"{node.name} declares {node.nbytes:,} bytes of shape {node.shape}, of which {node.id.get_storage_size():,}"

@@ -10,6 +10,7 @@ from typing import BinaryIO
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError, features
 
+from zest_rl.data.picture_size import check_size
 from zest_rl.errors import BadInput
 from zest_rl.runtime.files import check_file
 from zest_rl.types import Frame
@@ -19,11 +20,6 @@ SUFFIXES = (
     *((".avif",) if _HAS_AVIF else ()), ".bmp", ".gif", ".jfif", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp",
 )  # fmt: skip
 """File names that `list_images` counts as images, in any case; how a file is read depends on its content alone."""
-
-MAX_PIXELS = 16_000_000
-"""Larger images are refused by their header: a file of a few kB can unpack to gigabytes."""
-MAX_ASPECT = 100
-"""So are longer ones: an embedder that scales the short side of 1 x 100,000 pixels to 224 would need gigabytes."""
 
 _FORMATS = ("BMP", "GIF", "JPEG", "PNG", "TIFF", "WEBP", *(("AVIF",) if _HAS_AVIF else ()))
 """Never EPS, for which Pillow starts Ghostscript."""
@@ -121,19 +117,6 @@ def _check_still(image: Image.Image, what: str) -> None:
     n_frames = getattr(image, "n_frames", 1)
     if n_frames > 1 and image.format != "MPO":  # MPO: a JPEG with thumbnails behind it, as phones write
         raise BadInput(f"{what} is animated ({n_frames} frames), a still image is needed; save one frame of it as PNG")
-
-
-def check_size(width: int, height: int, what: str) -> None:
-    """Raise `BadInput` if a picture is too large or too long."""
-    if width * height > MAX_PIXELS:
-        raise BadInput(
-            f"{what} is too large: {width} x {height} pixels, at most {MAX_PIXELS / 1e6:.0f} million are read; scale "
-            "it down"
-        )
-    if max(width, height) > MAX_ASPECT * min(width, height):
-        raise BadInput(
-            f"{what} is too long: {width} x {height} pixels, one side may be {MAX_ASPECT} times the other; crop it"
-        )
 
 
 def _to_rgb(image: Image.Image, what: str) -> Frame:

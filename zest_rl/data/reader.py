@@ -322,9 +322,7 @@ class Dataset:
         return observed
 
     def _observations(self, group: h5py.Group) -> FloatArray:
-        observed = self._observed(group)
-        if list(observed) == ["observations"] and observed["observations"].ndim == 2:
-            return read_array(observed["observations"], np.float32)
+        self._observed(group)
         return numbers(group["observations"])
 
     def _actions(self, group: h5py.Group, discrete: bool) -> FloatArray:

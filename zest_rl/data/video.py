@@ -15,7 +15,8 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.data.images import MAX_PIXELS, check_size, list_images, read_image
+from zest_rl.data.images import list_images, read_image
+from zest_rl.data.picture_size import MAX_PIXELS, check_size
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime.files import check_file
 from zest_rl.types import Frame

@@ -17,7 +17,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from zest_rl.data import reader
-from zest_rl.data.observations import choose_pictures
+from zest_rl.data.observations import choose_pictures, joined, rejected
 from zest_rl.data.writer import DatasetCopy, Trajectories
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.views import Views
@@ -121,10 +121,12 @@ def _open_path(
 def _minari_frames(ds: reader.Dataset, keys: Sequence[str], cameras: Sequence[str]) -> EpisodeFrames:
     names = list(ds.groups)
     pictures = picture_entries(ds.file, f"{names[0]}/observations")
-    if cameras or not (keys or any(pictures.values())):
+    if cameras or not (keys or any(form.channels for form in pictures.values())):
         from zest_rl.sources.states import find_states
 
-        return find_states(ds.file, names, ds.record.env_spec, cameras, f"dataset {ds.id}")
+        try:
+            return find_states(ds.file, names, ds.record.env_spec, cameras, f"dataset {ds.id}")
+        except BadInput as error:
+            raise BadInput(f"{error}{rejected(pictures, 'observations')}") from error
     chosen = choose_pictures(pictures, keys, f"dataset {ds.id}", "observations")
-    views = tuple("/".join(part for part in ("observations", key) if part) for key in chosen)
-    return Pictures(ds.file, tuple(names), views)
+    return Pictures(ds.file, tuple(names), tuple(joined("observations", key) for key in chosen))

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from zest_rl.data.observations import choose_pictures
+from zest_rl.data.picture_forms import PictureForm
 from zest_rl.errors import BadInput, Notice, ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.files import path_under
@@ -115,14 +116,14 @@ class Info:
     def choose_views(self, keys: Sequence[str], root: Path) -> list[str]:
         """Return the videos that are the frames: those asked for, else the only one; none if there is none."""
         kinds = {name: "" if _is_depth(facts) else facts["dtype"] for name, facts in self.features.items()}
-        videos = {name: 3 if kind == "video" else None for name, kind in kinds.items()}
+        videos = {name: PictureForm(3) for name, kind in kinds.items() if kind == "video"}
         images = [name for name, kind in kinds.items() if kind == "image"]
-        if stored := [name for name in images if name in keys or not (keys or any(videos.values()))]:
+        if stored := [name for name in images if name in keys or not (keys or videos)]:
             raise BadInput(
                 f"the pictures {', '.join(stored)} of {root} are in its parquet files, which is not read; convert them "
                 "to videos with lerobot-edit-dataset, or give --frames FOLDER with a video of each episode"
             )
-        return choose_pictures(videos, keys, str(root)) if keys or any(videos.values()) else []
+        return choose_pictures(videos, keys, str(root)) if keys or videos else []
 
     def listed(self, row: Mapping[str, Any], views: Sequence[str]) -> ListedEpisode:
         """Read a row of ``meta/episodes``; raises what `int`, `float` and missing keys raise."""

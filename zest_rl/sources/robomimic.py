@@ -20,7 +20,7 @@ from zest_rl.data.hdf5 import check_rows, mapped_errors, open_hdf5, read_array
 from zest_rl.data.observations import choose_pictures, entries, is_numbers
 from zest_rl.errors import BadInput, Notice
 from zest_rl.sources.conversion import ConvertedEpisode, ConvertedTrajectories
-from zest_rl.sources.pictures import Pictures, picture_entries
+from zest_rl.sources.pictures import Pictures, picture_entries, split_part
 from zest_rl.types import FloatArray
 
 
@@ -158,11 +158,11 @@ def open_robomimic(
     pictures = picture_entries(path, f"{names[0]}/obs")
     read = partial(read_episodes, path.resolve(), names)
     trajectories = ConvertedTrajectories(path.resolve(), "robomimic", tuple(n_steps), n_bytes, read)
-    if not with_frames or not (keys or any(pictures.values())):
+    if not with_frames or not (keys or any(form.channels for form in pictures.values())):
         return trajectories, None
     chosen = choose_pictures(pictures, keys, str(path), "obs")
     after = tuple(f"next_obs/{key}" for key in chosen)
     with open_hdf5(path) as file:
-        has_last = all(key in file[name] for key in after for name in names)
+        has_last = all(split_part(key)[0] in file[name] for key in after for name in names)
     views = tuple(f"obs/{key}" for key in chosen)
     return trajectories, Pictures(path.resolve(), tuple(names), views, after if has_last else ())
