@@ -114,6 +114,7 @@ def relabel_ms(episodes: dict[str, NDArray[Any]]) -> tuple[float, float]:
 
 def fill_cache(embedded: NDArray[np.float64], states: NDArray[np.float64]) -> int:
     """Give all of `states` (N, 30) the embeddings of those that are `embedded`, in turn; return how many differ."""
+    state_embeddings.N_CHECKED = 0  # these are not the embeddings of the states
     cache = StateEmbedder(VIEWS, CONFIG.embedder)
     vectors = cache.embedded(embedded).embeddings[1:]
     distinct = distinct_states(states, VIEWS)

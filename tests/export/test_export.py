@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -18,18 +20,23 @@ from PIL import Image
 from pyarrow import parquet
 from read_dataset import read
 
+import zest_rl.export
 from zest_rl import cli
 from zest_rl.data import reader
 from zest_rl.data.observations import is_numbers
 from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.export import export, transitions
+from zest_rl.export import WRITERS, Format, export, transitions
 from zest_rl.export.lerobot import DATA_FILE
 from zest_rl.export.transitions import shape_rewards
 from zest_rl.kitchen.views import Views
 from zest_rl.rewards.relabel import relabel_source
 from zest_rl.rewards.scorer import ScorerConfig
+from zest_rl.runtime import artifacts
 from zest_rl.sources.kitchen import kitchen_source
+
+if TYPE_CHECKING:
+    from conftest import Disk
 
 SIDE = 16
 ROOM = {
@@ -227,26 +234,30 @@ def test_progress_needs_scores_and_takes_no_shape(collected: str, tmp_path: Path
 
 
 def test_without_pyarrow_the_extra_is_named(collected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    (tmp_path / "without").mkdir()
+    (tmp_path / "without/pyarrow.py").write_text("raise ImportError('not installed')")
+    monkeypatch.syspath_prepend(str(tmp_path / "without"))
     with pytest.raises(ZestError, match=r"pip install 'zest-rl\[lerobot\]'"):
         export(collected, "lerobot", tmp_path / "x")
     assert not (tmp_path / "x").exists()
 
 
-def test_exporting_needs_little_more_than_numpy_and_h5py(collected: str, tmp_path: Path) -> None:
+def test_exporting_needs_only_numpy_h5py_and_filelock(collected: str, tmp_path: Path) -> None:
     """So that it works beside a library whose pins exclude ours."""
+    site = tmp_path / "site"
+    site.mkdir()
+    for package in Path(h5py.__file__).parents[1].iterdir():
+        if package.name.split("-")[0].split(".")[0] in ("numpy", "h5py", "filelock"):
+            (site / package.name).symlink_to(package)
+    (site / "zest_rl").symlink_to(Path(reader.__file__).parents[1])
     code = (
         "import sys; from pathlib import Path; from zest_rl.export import export, to_d3rlpy, to_torchrl; "
         "formats = ('npz', 'd4rl', 'robomimic', 'd3rlpy', 'torchrl'); "
-        "[export(sys.argv[1], to, Path(sys.argv[2]) / to) for to in formats]; "
-        "print(*{name.split('.')[0] for name, module in sys.modules.items() "
-        "if 'site-packages' in (getattr(module, '__file__', None) or '')})"
+        "[export(sys.argv[1], to, Path(sys.argv[2]) / to) for to in formats]"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, collected, str(tmp_path)], capture_output=True, text=True, check=True
-    )
-    loaded = {name for name in done.stdout.split() if not name.startswith("_")}
-    assert {"h5py", "numpy"} <= loaded <= {"h5py", "numpy", "filelock", "zest_rl"}
+    alone = os.environ | {"PYTHONPATH": str(site)}
+    subprocess.run([sys.executable, "-S", "-c", code, collected, str(tmp_path)], env=alone, check=True)
+    assert {"npz", "d4rl", "robomimic", "d3rlpy", "torchrl"} <= {path.name for path in tmp_path.iterdir()}
 
 
 def test_rewards_take_the_shape_that_is_asked_for() -> None:
@@ -483,3 +494,68 @@ def test_a_single_episode_is_one_to_train_robomimic_on(root: Path, tmp_path: Pat
     with h5py.File(export(name, "robomimic", tmp_path / "data.hdf5").path) as file:
         masks = {mask: members[()].tolist() for mask, members in file["mask"].items()}
     assert masks == {"train": [b"demo_0"], "valid": []}
+
+
+# --- full disks, cuts and competitors ---------------------------------------------------------------------------------
+
+
+EXPORT_FAILED = r"the export could not be written: the (disk is full|writing process died \(SIG).*; nothing was left"
+
+
+def write_without_checking_space(*args: Any) -> Any:
+    """As the child process of an export, whose disk fills up after the space was checked."""
+    artifacts.check_free_space = lambda folder, n_bytes: None
+    return zest_rl.export._write(*args)
+
+
+@pytest.mark.parametrize("to", WRITERS)
+def test_a_disk_that_fills_up_while_exporting_is_an_error_of_this_process_and_leaves_nothing(
+    to: Format, scored: str, disk: Disk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zest_rl.export, "_write", write_without_checking_space)
+    disk.fill(4096)
+    with pytest.raises(ZestError, match=EXPORT_FAILED):
+        export(scored, to, disk.path / "out")
+    assert {path.name for path in disk.path.iterdir()} == {"ballast", ".out.lock"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("to", ["d4rl", "robomimic", "d3rlpy"])
+def test_whatever_room_is_left_an_hdf5_file_is_whole_or_not_there(
+    to: Format, scored: str, disk: Disk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zest_rl.export, "_write", write_without_checking_space)
+    whole = export(scored, to, tmp_path / "whole")
+    n_written = 0
+    for n_pages in range(0, whole.n_bytes // 4096 + 8, 2):
+        disk.fill(4096 * n_pages)
+        with suppress(ZestError):
+            written = export(scored, to, disk.path / "out")
+            assert written.n_bytes == whole.n_bytes
+            written.path.unlink()
+            n_written += 1
+        (disk.path / "ballast").unlink()
+    assert 1 <= n_written <= 8
+
+
+def test_an_export_for_which_there_is_no_room_is_refused_beforehand(scored: str, disk: Disk) -> None:
+    with pytest.raises(ZestError, match="not enough disk space"):
+        export(scored, "d4rl", disk.path / "out")
+    assert {path.name for path in disk.path.iterdir()} == {".out.lock"}
+
+
+def exporting(dataset_id: str, to: str, path: Path) -> subprocess.Popen[str]:
+    code = "import sys; from pathlib import Path; from zest_rl import cli; sys.exit(cli.main(sys.argv[1:]))"
+    words = ["export", dataset_id, "--to", to, "--output", str(path)]
+    return subprocess.Popen([sys.executable, "-c", code, *words], stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.parametrize("to", ["npz", "torchrl"])
+def test_of_two_exports_to_one_place_the_second_is_refused_and_harms_nothing(
+    to: str, scored: str, tmp_path: Path
+) -> None:
+    both = [exporting(scored, to, tmp_path / "out") for _ in range(2)]
+    messages = [process.communicate(timeout=120)[1] for process in both]
+    assert sorted(process.returncode for process in both) == [0, 2]
+    assert sum("exists; delete it, or choose another --output" in message for message in messages) == 1
+    assert {path.name for path in tmp_path.glob("*out*")} == {"out", ".out.lock"}

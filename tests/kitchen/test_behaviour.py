@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from zest_rl.errors import BadInput
+from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen import behaviour as kitchen_behaviour
 from zest_rl.kitchen.behaviour import (
     Behaviour,
@@ -23,7 +23,7 @@ from zest_rl.kitchen.behaviour import (
 from zest_rl.kitchen.collect_config import LARGEST
 from zest_rl.kitchen.env import HORIZON, env_spec
 from zest_rl.kitchen.experts import DONE_PROGRESS, Manner, make_expert
-from zest_rl.runtime.arrays import Arrays, concatenate
+from zest_rl.runtime.arrays import Arrays, concatenate, write_arrays
 
 NOISY = Behaviour("micro", "expert", noise_max=0.6)
 DRAWN = {"level", "stop_at", "speed"}
@@ -56,12 +56,33 @@ def test_episode_i_is_the_same_however_many_are_run_and_by_how_many_processes(
     assert_equal(run_behaviour(NOISY, 1, first=2, n_workers=1), {name: a[2:3] for name, a in first_three.items()})
 
 
-def test_finished_episodes_are_taken_from_the_cache(first_three: Arrays, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_finished_episodes_are_taken_from_the_cache_and_one_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     reported: list[int] = []
+    again: list[int] = []
+    before = run_behaviour(NOISY, 2, n_workers=1)
+
+    def counted(behaviour: Behaviour, index: int) -> Arrays:
+        again.append(index)
+        return rollout(behaviour, index)
+
+    monkeypatch.setattr(kitchen_behaviour, "rollout", counted)
+    assert_equal(run_behaviour(NOISY, 2, n_workers=1, on_progress=reported.append), before)
+    assert reported == [2]
+    assert len(again) == 1
+
+
+def test_damaged_episodes_are_run_again_and_exchanged_ones_are_refused() -> None:
     before = run_behaviour(NOISY, 1, n_workers=1)
-    monkeypatch.setattr(kitchen_behaviour, "rollout", lambda behaviour, index: pytest.fail("done again"))
-    assert_equal(run_behaviour(NOISY, 1, n_workers=1, on_progress=reported.append), before)
-    assert reported == [1]
+    (path,) = behaviour_folder(NOISY).glob("*.npz")
+    whole = path.read_bytes()
+    for damaged in (b"", whole[:-1000], whole[:5000] + b"\0" + whole[5001:]):
+        path.write_bytes(damaged)
+        assert_equal(run_behaviour(NOISY, 1, n_workers=1), before)
+    write_arrays(path, {**before, "gt_reward": before["gt_reward"][:, :50]})
+    assert_equal(run_behaviour(NOISY, 1, n_workers=1), before)
+    write_arrays(path, rollout(NOISY, 1))
+    with pytest.raises(ZestError, match="are not those that this machine computes"):
+        run_behaviour(NOISY, 1, n_workers=1)
 
 
 def test_what_a_behaviour_is_decides_where_its_episodes_are_kept() -> None:
@@ -208,7 +229,7 @@ def test_a_behaviour_that_makes_no_sense_is_refused(changes: dict[str, Any], rul
 
 
 def test_no_episodes_and_unknown_tasks_are_refused() -> None:
-    with pytest.raises(BadInput, match="n_episodes must be at least 1, got 0"):
+    with pytest.raises(BadInput, match="n-episodes must be at least 1, got 0"):
         run_behaviour(NOISY, 0)
     with pytest.raises(BadInput, match="unknown task 'knob4'"):
         run_behaviour(Behaviour("knob4", "expert"), 1, n_workers=1)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -18,7 +19,7 @@ from zest_rl.kitchen.env import KitchenEnv
 from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.rewards import state_embeddings
 from zest_rl.rewards.state_embeddings import STATES_PER_SHARD, StateEmbedder
-from zest_rl.runtime.arrays import write_arrays
+from zest_rl.runtime.arrays import read_arrays, write_arrays
 from zest_rl.runtime.parallel import chunks, one_thread
 
 VIEWS = Views("micro", n_views=2, size=96)
@@ -123,21 +124,66 @@ def test_a_damaged_shard_is_embedded_again_and_replaced(damage: str) -> None:
     assert third.n_embedded == 0
 
 
-def test_damage_that_shows_late_is_an_error_and_is_then_mended() -> None:
+def test_damage_that_shows_late_is_mended_without_a_word(capfd: pytest.CaptureFixture[str]) -> None:
     first = single()
     expected, _ = embedded(first, opening(2))
     (shard,) = first.folder.glob("*.npz")
     content = bytearray(shard.read_bytes())
-    content[content.index(b"embeddings.npy") + 2000] ^= 1  # among the numbers, of which a checksum is kept
+    content[content.index(b"embeddings.npy") + 2000] ^= 1  # among the numbers
     shard.write_bytes(content)
     state_embeddings._read_shard.cache_clear()
-    with pytest.raises(ZestError, match="are missing or damaged; run the same command again"):
-        first.embedded(opening(2))
-    np.testing.assert_array_equal(embedded(first, opening(2))[0], expected)
+    again = first.embedded(opening(2))
+    np.testing.assert_array_equal(again.embeddings[1:], expected)
     assert first.n_embedded == 4, "the same object embeds them again"
+    later = single()
+    np.testing.assert_array_equal(embedded(later, opening(2))[0], expected)
+    assert later.n_embedded == 0, "and keeps them"
+    assert capfd.readouterr() == ("", "")
+
+
+def exchange(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Give whole files, with their digests, other numbers."""
+    for path in folder.glob("*.npz"):
+        arrays = read_arrays(path)
+        assert arrays is not None
+        write_arrays(path, {**arrays, "embeddings": change(arrays["embeddings"])})
+    state_embeddings._read_shard.cache_clear()
+
+
+@pytest.mark.parametrize("online", [False, True], ids=["recorded", "in a rollout"])
+def test_whole_files_with_other_numbers_are_refused_and_nothing_is_deleted(online: bool) -> None:
+    first = single()
+    embedded(first, opening(40))
+    exchange(first.folder, lambda vectors: np.roll(vectors, len(vectors) // 2, axis=0))
+    before = {path: path.read_bytes() for path in first.folder.iterdir()}
+    later = single()
+    with pytest.raises(
+        ZestError, match=rf"cache {first.folder} are not .* off by \d+% of .*; delete that folder, then"
+    ):
+        later.embed_now(opening(3, last=-0.9)) if online else later.embed(opening(40))
+    assert {path: path.read_bytes() for path in first.folder.iterdir()} == before
+
+
+def test_the_last_digits_of_another_device_are_no_other_numbers() -> None:
+    first = single()
+    expected, _ = embedded(first, opening(4))
+    noise = np.random.default_rng(0).normal(size=(4, 2, 1280)).astype(np.float32)
+    exchange(first.folder, lambda vectors: vectors * (1 + 0.01 * noise))
+    assert not np.array_equal(embedded(single(), opening(4))[0], expected)
+
+
+@pytest.mark.parametrize(
+    "change", [lambda v: v[:, :1].copy(), lambda v: v.astype(np.float64), lambda v: v * np.nan, lambda v: v[:1]]
+)
+def test_whole_files_of_another_form_are_damage(change: Callable[[np.ndarray], np.ndarray]) -> None:
+    first = single()
+    expected, _ = embedded(first, opening(3))
+    exchange(first.folder, change)
+    np.testing.assert_array_equal(embedded(single(), opening(3))[0], expected)
 
 
 def test_memory_does_not_grow_with_the_number_of_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(state_embeddings, "N_CHECKED", 0)  # here a state's vector is its number
     monkeypatch.setattr(state_embeddings, "_read_shard", lru_cache(maxsize=2)(state_embeddings._read_shard.__wrapped__))
     states = canonical_states(opening(1200), VIEWS)
     folder = single().folder
@@ -168,7 +214,7 @@ def test_embedding_within_a_rollout_gives_the_bits_that_embedding_a_dataset_give
     rows = online.embed_now(states)
     assert rows.shape == (6, 2, 1280)
     assert online.n_embedded == 5
-    assert not cache.exists(), "nothing is written during a rollout"
+    assert not list(cache.rglob("*.npz")), "nothing is written during a rollout"
 
     embeddings, index = embedded(single(), states)
     np.testing.assert_array_equal(rows, embeddings[index])

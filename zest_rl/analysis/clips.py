@@ -13,8 +13,10 @@ import numpy as np
 from zest_rl.data.video import VIDEO_SUFFIXES, read_frames
 from zest_rl.embedders import Embedder
 from zest_rl.errors import BadInput, nearest
+from zest_rl.rewards.embeddings import check_equal
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_arrays, write_arrays
+from zest_rl.runtime.cache import cache_folder
 from zest_rl.runtime.parallel import one_thread
 from zest_rl.types import FloatArray
 
@@ -135,7 +137,7 @@ def _visible(folder: Path) -> list[Path]:
 def embed_clips(
     clips: Sequence[Clip], embedder: Embedder, n_frames: int, on_progress: Callable[[int, int], None] | None = None
 ) -> list[FloatArray]:
-    """Embed clips, each once: embeddings are cached by content.
+    """Embed clips, each once: embeddings are cached by content, and one is compared with the same computed again.
 
     Args:
         clips: to be embedded.
@@ -146,18 +148,23 @@ def embed_clips(
     Returns:
         (n, D) float32 per clip.
     """
-    vectors = []
+    folder, vectors, checked = cache_folder("clips"), [], False
     for clip in clips:
         parts = sorted(clip.path.iterdir()) if clip.path.is_dir() else [clip.path]
         content = [artifacts.hash_file(path) for path in parts if path.is_file()]
         digest = artifacts.hash_json([content, embedder.fingerprint, n_frames])
-        path = artifacts.cache_dir() / "clips" / f"{digest[:20]}.npz"
-        cached = read_arrays(path)
-        if cached is None:
+        path = folder / f"{digest[:20]}.npz"
+        arrays = read_arrays(path, {"embeddings": (np.float32, (None, embedder.dim))})
+        if arrays is None:
             with one_thread():
-                cached = {"embeddings": embedder.embed_images(read_frames(clip.path, n_frames))}
-            write_arrays(path, cached)
-        vectors.append(np.asarray(cached["embeddings"], dtype=np.float32))
+                arrays = {"embeddings": embedder.embed_images(read_frames(clip.path, n_frames))}
+            write_arrays(path, arrays)
+        elif not checked:
+            checked = True
+            with one_thread():
+                again = embedder.embed_images(read_frames(clip.path, n_frames)[:1])
+            check_equal(folder, [(arrays["embeddings"][:1], again)])
+        vectors.append(arrays["embeddings"])
         if on_progress is not None:
             on_progress(len(vectors), len(clips))
     return vectors

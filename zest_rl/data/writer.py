@@ -5,8 +5,6 @@ The layout on disk is drawn in `zest_rl.data.reader`, the alignment of the array
 
 from __future__ import annotations
 
-import errno
-import multiprocessing
 import os
 import shutil
 import warnings
@@ -25,7 +23,7 @@ from zest_rl.data.hdf5 import open_hdf5
 from zest_rl.data.reader import SOURCE_REWARD, Dataset
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
-from zest_rl.runtime.parallel import die_with_parent, starting_children
+from zest_rl.runtime.child import write_in_child
 from zest_rl.types import Episode, FloatArray
 
 
@@ -53,35 +51,6 @@ class Recording:
         wrong = [name for name in ("qpos", "qvel", "gt_success") if len(getattr(self, name)) != len(self.obs)]
         if wrong:
             raise BadInput(f"{' and '.join(wrong)} must have T + 1 = {len(self.obs)} rows, as many as obs")
-
-
-def _in_child(build: Callable[..., None], *args: object) -> None:
-    """Run an HDF5 write in a child process: on a full disk the library kills its process."""
-    context = multiprocessing.get_context("spawn")
-    receive, send = context.Pipe(duplex=False)
-    child = context.Process(target=_report_errors, args=(send, build, *args))
-    with starting_children():
-        child.start()
-    send.close()
-    try:
-        message = receive.recv()
-    except EOFError:
-        message = "the writing process died, as HDF5 does on a full disk"
-    child.join()
-    if message is not None:
-        raise ZestError(f"the dataset could not be written: {message}; nothing was left behind, try again")
-
-
-def _report_errors(send: Any, build: Callable[..., None], *args: object) -> None:
-    die_with_parent()  # else it would go on writing to the files of the next attempt
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # on a full disk HDF5 prints hundreds of tracebacks
-    try:
-        build(*args)
-    except Exception as error:
-        full = os.strerror(errno.ENOSPC) in str(error)
-        send.send("the disk is full" if full else f"{type(error).__name__}: {error}")
-    else:
-        send.send(None)
 
 
 def _set_metadata(path: Path, **values: object) -> None:
@@ -199,7 +168,7 @@ def write_dataset(
     }
     n_bytes = sum(r.obs.nbytes + r.actions.nbytes + r.qpos.nbytes + r.qvel.nbytes for r in recordings)
     with _staged(dataset_id, 2 * n_bytes) as staging:
-        _in_child(_build_new, staging / "root", dataset_id, recordings, env_spec, fields)
+        write_in_child("the dataset", _build_new, staging / "root", dataset_id, recordings, env_spec, fields)
         (staging / "root" / dataset_id / "data").rename(staging / "data")
         shutil.rmtree(staging / "root")
         _set_metadata(staging / METADATA_FILE, zest=dict(zest))
@@ -347,7 +316,7 @@ def write_scored(
         raise BadInput("rewards and scores must be finite, got NaN or infinity")
     with _staged(dataset_id, 2 * trajectories.n_bytes) as staging:
         scored = [_scored(*new) for new in zip(rewards, scores, trajectories.rewards_to_keep(), strict=True)]
-        _in_child(_build_scored, trajectories, staging, scored)
+        write_in_child("the dataset", _build_scored, trajectories, staging, scored)
         metadata = artifacts.read_json(staging / METADATA_FILE)
         _set_metadata(
             staging / METADATA_FILE,

@@ -30,6 +30,8 @@ from zest_rl.types import EpisodeResult
 EPISODES_PER_JOB, N_JOBS = 5, 10
 """An evaluation is split into `N_JOBS` parts of at least `EPISODES_PER_JOB` episodes: small enough that all cores have
 work and an interrupted evaluation loses little, large enough that a policy acts on a batch."""
+MAX_EPISODES = 10_000
+"""Of an evaluation; a part holds one environment for each of its episodes in memory."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class EvaluationConfig:
         problems = []
         if self.n_episodes < 1:
             problems.append(f"n_episodes must be at least 1, got {self.n_episodes}")
+        if self.n_episodes > MAX_EPISODES:
+            problems.append(f"n_episodes must be at most {MAX_EPISODES}, got {self.n_episodes}")
         if self.seed < 0:
             problems.append(f"seed must be at least 0, got {self.seed}")
         if self.rtg not in get_args(Rtg):
@@ -184,7 +188,7 @@ def evaluate(
         seeds = range(config.seed + part.start, config.seed + part.stop)
         jobs[f"seeds-{seeds.start}-{seeds.stop}{'-scored' if scored else ''}"] = (run, config, seeds, scored, device)
     with artifacts.lock(folder):
-        for name in cached_jobs(_evaluate_part, jobs, folder / "parts", n_workers=n_workers):
+        for name in cached_jobs(_evaluate_part, jobs, folder / "parts", n_workers=n_workers, stage="rollouts"):
             if on_progress is not None:
                 on_progress(len(jobs[name][2]))
         traces = read_parts(folder / "parts", jobs)

@@ -17,8 +17,7 @@ filelock (and pyarrow for LeRobot's), so it works in the environments that those
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -36,6 +35,7 @@ from zest_rl.export.transitions import (
     transitions,
 )
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.child import write_in_child
 
 __all__ = ["Exported", "Format", "Shape", "Transitions", "export", "to_d3rlpy", "to_torchrl", "transitions"]
 
@@ -110,6 +110,22 @@ def export(
     _check_new(path)
     if to == "lerobot-progress" and (shape, normalise) != ("step", False):
         raise BadInput("lerobot-progress holds scores of frames and no rewards; leave --shape and --normalise out")
+    with artifacts.lock(path):
+        _check_new(path)  # an equal command may have run at the same time
+        with artifacts.staged_folder(path) if writer.is_folder else artifacts.atomic_path(path) as staging:
+            exported = write_in_child("the export", _write, staging, dataset_id, to, shape, normalise, fps)
+    files = [file for file in (path, *path.rglob("*")) if file.is_file()]
+    return replace(exported, path=path, n_bytes=sum(file.stat().st_size for file in files))
+
+
+def _check_new(path: Path) -> None:
+    if path.exists():
+        raise BadInput(f"{path} exists; delete it, or choose another --output")
+
+
+def _write(path: Path, dataset_id: str, to: Format, shape: Shape, normalise: bool, fps: int | None) -> Exported:
+    """Read a dataset and write it to a temporary place; arguments and errors as in `export`."""
+    writer = WRITERS[to]
     with open_dataset(dataset_id) as ds:
         data = read_progress(ds) if to == "lerobot-progress" else read_transitions(ds, shape, normalise)
     if writer.loses_last_step and shape == "terminal" and any(episode["timeouts"].any() for episode in data.episodes):
@@ -117,18 +133,10 @@ def export(
             f"{writer.loses_last_step} leaves out the transition at a time limit, which holds the only reward of "
             "'terminal'; export 'step' or 'difference', or to npz"
         )
-    write = partial(lerobot.write, fps=fps) if to == "lerobot" else writer.write
     size = sum(array.nbytes for episode in data.episodes for array in episode.values())
     artifacts.check_free_space(path.parent, 2 * size)
-    with artifacts.lock(path):
-        _check_new(path)  # an equal command may have run at the same time
-        with artifacts.staged_folder(path) if writer.is_folder else artifacts.atomic_path(path) as place:
-            write(place, data)
-    files = [file for file in (path, *path.rglob("*")) if file.is_file()]
-    n_bytes = sum(file.stat().st_size for file in files)
-    return Exported(path, len(data.episodes), len(data), tuple(data.episodes[0]), n_bytes, data.left_out)
-
-
-def _check_new(path: Path) -> None:
-    if path.exists():
-        raise BadInput(f"{path} exists; delete it, or choose another --output")
+    if to == "lerobot":
+        lerobot.write(path, data, fps)
+    else:
+        writer.write(path, data)
+    return Exported(path, len(data.episodes), len(data), tuple(data.episodes[0]), 0, data.left_out)

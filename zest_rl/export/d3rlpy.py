@@ -13,9 +13,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import h5py
-
 from zest_rl.errors import BadInput
+from zest_rl.export.hdf5 import write_hdf5
 from zest_rl.export.transitions import Shape, TransitionDataset, Transitions, transitions
 
 if TYPE_CHECKING:
@@ -47,14 +46,10 @@ def fields(episode: Transitions) -> dict[str, object]:
 
 def write(path: Path, data: TransitionDataset) -> None:
     """Write `NAME_I` of every episode; d3rlpy ignores names that are not in ``columns``, such as ``zest_score_I``."""
-    with h5py.File(path, "w") as file:
-        file["columns"] = list(fields(data.episodes[0]))
-        file["num_episodes"] = len(data.episodes)
-        file["version"] = VERSION
-        for i, episode in enumerate(data.episodes):
-            for name, values in {**episode, **fields(episode)}.items():
-                file[f"{name}_{i}"] = values
-        file.attrs["about"] = json.dumps(data.about)
+    arrays = {"columns": list(fields(data.episodes[0])), "num_episodes": len(data.episodes), "version": VERSION}
+    for i, episode in enumerate(data.episodes):
+        arrays |= {f"{name}_{i}": values for name, values in {**episode, **fields(episode)}.items()}
+    write_hdf5(path, arrays, {"/": {"about": json.dumps(data.about)}})
 
 
 def to_d3rlpy(dataset_id: str, *, shape: Shape = "step", normalise: bool = False) -> d3rlpy.dataset.ReplayBuffer:

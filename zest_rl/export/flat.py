@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import h5py
 import numpy as np
 
+from zest_rl.export.hdf5 import write_hdf5
 from zest_rl.export.transitions import TransitionDataset
 
 
@@ -19,7 +19,4 @@ def write_npz(path: Path, data: TransitionDataset) -> None:
 
 def write_d4rl(path: Path, data: TransitionDataset) -> None:
     """Write the same arrays at the root of an HDF5 file, and ``about`` as an attribute."""
-    with h5py.File(path, "w") as file:
-        for name, values in data.flat.items():
-            file.create_dataset(name, data=values, compression="gzip")
-        file.attrs["about"] = json.dumps(data.about)
+    write_hdf5(path, data.flat, {"/": {"about": json.dumps(data.about)}}, compression="gzip")

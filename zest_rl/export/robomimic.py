@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
-import h5py
 import numpy as np
 
+from zest_rl.export.hdf5 import write_hdf5
 from zest_rl.export.transitions import TransitionDataset
 
 VALID_SHARE = 0.1
@@ -25,24 +26,19 @@ def write(path: Path, data: TransitionDataset) -> None:
     data.check_continuous("robomimic")
     episodes = data.episodes
     names = [f"demo_{i}" for i in range(len(episodes))]
-    with h5py.File(path, "w") as file:
-        group = file.create_group("data")
-        for name, episode in zip(names, episodes, strict=True):
-            demo = group.create_group(name)
-            demo.attrs["num_samples"] = len(episode["rewards"])
-            demo.create_dataset("obs/flat", data=episode["observations"])
-            demo.create_dataset("next_obs/flat", data=episode["next_observations"])
-            for key in ("actions", "rewards"):
-                demo.create_dataset(key, data=episode[key])
-            demo.create_dataset("dones", data=(episode["terminals"] | episode["timeouts"]).astype(np.int64))
-            for key in sorted(episode.keys() - {"observations", "next_observations", "actions", "rewards"}):
-                demo.create_dataset(key, data=episode[key])
-        group.attrs["total"] = len(data)
-        spec = data.record.env or {"id": "unknown"}
-        env = {"env_name": spec["id"], "type": 2, "env_kwargs": spec.get("kwargs", {})}  # 2: a Gym environment
-        group.attrs["env_args"] = json.dumps(env)
-        group.attrs["about"] = json.dumps(data.about)
-        n_valid = max(1, round(VALID_SHARE * len(names))) if len(names) > 1 else 0
-        valid = set(np.random.default_rng(0).permutation(len(names))[:n_valid].tolist())
-        for mask, members in (("valid", valid), ("train", set(range(len(names))) - valid)):
-            file.create_dataset(f"mask/{mask}", data=np.array([names[i].encode() for i in sorted(members)], dtype="S"))
+    arrays: dict[str, Any] = {}
+    attributes: dict[str, dict[str, Any]] = {}
+    for name, episode in zip(names, episodes, strict=True):
+        demo = f"data/{name}"
+        attributes[demo] = {"num_samples": len(episode["rewards"])}
+        renamed = {"observations": "obs/flat", "next_observations": "next_obs/flat"}
+        arrays |= {f"{demo}/{renamed.get(key, key)}": values for key, values in episode.items()}
+        arrays[f"{demo}/dones"] = (episode["terminals"] | episode["timeouts"]).astype(np.int64)
+    spec = data.record.env or {"id": "unknown"}
+    env = {"env_name": spec["id"], "type": 2, "env_kwargs": spec.get("kwargs", {})}  # 2: a Gym environment
+    attributes["data"] = {"total": len(data), "env_args": json.dumps(env), "about": json.dumps(data.about)}
+    n_valid = max(1, round(VALID_SHARE * len(names))) if len(names) > 1 else 0
+    valid = set(np.random.default_rng(0).permutation(len(names))[:n_valid].tolist())
+    for mask, members in (("valid", valid), ("train", set(range(len(names))) - valid)):
+        arrays[f"mask/{mask}"] = np.array([names[i].encode() for i in sorted(members)], dtype="S")
+    write_hdf5(path, arrays, attributes)

@@ -16,6 +16,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.data.reader import open_dataset
@@ -58,7 +59,7 @@ def write(folder: Path, data: TransitionDataset) -> None:
 def _write_level(folder: Path, arrays: dict[str, NDArray[Any]], children: dict[str, Any]) -> None:
     meta: dict[str, Any] = dict(children)
     for name, values in arrays.items():
-        values.tofile(folder / f"{name}.memmap")
+        (folder / f"{name}.memmap").write_bytes(np.ascontiguousarray(values).data)
         dtype = f"torch.{values.dtype.name}"
         meta[name] = {"device": "cpu", "shape": list(values.shape), "dtype": dtype, "is_nested": False}
     n_transitions = len(arrays["observation"])

@@ -7,6 +7,7 @@ trajectory, are fields of `Behaviour`.
 
 from __future__ import annotations
 
+import random
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -18,17 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.data.writer import Recording
-from zest_rl.errors import BadInput
-from zest_rl.kitchen.collect_config import LARGEST, check_flaws
+from zest_rl.errors import BadInput, ZestError
+from zest_rl.kitchen.collect_config import LARGEST, check_flaws, check_n_episodes
 from zest_rl.kitchen.env import ACT_DIM, HORIZON, env_spec
 from zest_rl.kitchen.experts import DONE_PROGRESS, Manner, add_uniform_noise, make_expert
+from zest_rl.kitchen.scene import N_QPOS
 from zest_rl.kitchen.tasks import get_task
 from zest_rl.runtime import artifacts
-from zest_rl.runtime.arrays import Arrays, concatenate
+from zest_rl.runtime.arrays import Arrays, Layout, concatenate, read_arrays
+from zest_rl.runtime.cache import cache_folder
 from zest_rl.runtime.parallel import cached_jobs, chunks, read_parts
 from zest_rl.types import FloatArray
 
 EPISODES_PER_JOB = 5
+OBS_DIM, N_QVEL = 59, 29  # of the kitchen, see `zest_rl.kitchen.env.KitchenEnv`
 _ARRAYS = ("obs", "actions", "qpos", "qvel", "gt_reward", "gt_success")  # of a `Recording`
 STOP_BETWEEN = (0.1, 1.0)
 _CODE = ("behaviour.py", "env.py", "arm.py", "experts.py", "tasks.py")  # with the behaviour, determines an episode
@@ -124,7 +128,10 @@ def draw_manner(behaviour: Behaviour, rng: np.random.Generator) -> tuple[Manner,
     return manner, (bias * behaviour.bias_max * directions[3:]).astype(np.float32)
 
 
-def _rollouts(job: tuple[Behaviour, range]) -> Arrays:
+_Job = tuple[Behaviour, range]
+
+
+def _rollouts(job: _Job) -> Arrays:
     behaviour, indices = job
     return concatenate([rollout(behaviour, index) for index in indices])
 
@@ -139,21 +146,69 @@ def run_behaviour(
 ) -> Arrays:
     """Run episodes `first` … `first` + `n_episodes` − 1 on all cores; finished parts are kept in the cache.
 
+    One of the episodes that were in the cache is run again, and compared.
+
     Returns:
         Arrays named as in `Recording`, each with a leading axis of length `n_episodes`.
+
+    Raises:
+        BadInput: `n_episodes` is below 1 or above `MAX_EPISODES`.
+        ZestError: a process died, or the cache holds other episodes.
     """
-    if n_episodes < 1:
-        raise BadInput(f"n_episodes must be at least 1, got {n_episodes}")
+    check_n_episodes(n_episodes)
     folder = behaviour_folder(behaviour)
     jobs = {}
     for part in chunks(n_episodes, EPISODES_PER_JOB):
         indices = range(first + part.start, first + part.stop)
         jobs[f"episodes-{indices.start}-{indices.stop}"] = (behaviour, indices)
+    cache_folder("episodes")
     with artifacts.lock(folder):
-        for name in cached_jobs(_rollouts, jobs, folder, n_workers=n_workers):
+        cache_folder("episodes", folder.name)  # here, because the command before may have removed it
+        _check(folder, jobs)
+        options: dict[str, Any] = {"n_workers": n_workers, "stage": "rolling out the expert", "layout": _layout}
+        for name in cached_jobs(_rollouts, jobs, folder, **options):
             if on_progress is not None:
                 on_progress(len(jobs[name][1]))
-        return read_parts(folder, jobs)
+        return read_parts(folder, jobs, {name: _layout(job) for name, job in jobs.items()})
+
+
+def _check(folder: Path, jobs: Mapping[str, _Job]) -> None:
+    """Run one of the episodes in the cache again, and compare.
+
+    Raises:
+        ZestError: it is another; nothing is deleted, because either may be right.
+    """
+    kept = [name for name in jobs if (folder / f"{name}.npz").exists()]
+    if not kept:
+        return
+    name = random.choice(kept)
+    behaviour, indices = jobs[name]
+    i = random.randrange(len(indices))
+    if (cached := read_arrays(folder / f"{name}.npz", _layout(jobs[name]))) is None:
+        return
+    again = rollout(behaviour, indices[i])
+    if not all(np.allclose(array[i], again[name][0], atol=1e-3) for name, array in cached.items()):
+        raise ZestError(
+            f"episodes in the cache {folder} are not those that this machine computes: its files were exchanged, or "
+            "made on another one; delete that folder, then run the same command again"
+        )
+
+
+def _layout(job: _Job) -> Layout:
+    n = len(job[1])
+    frames, number = (n, HORIZON + 1), (np.float64, (n,))
+    return {
+        "obs": (np.float32, (*frames, OBS_DIM)),
+        "actions": (np.float32, (n, HORIZON, ACT_DIM)),
+        "qpos": (np.float64, (*frames, N_QPOS)),
+        "qvel": (np.float64, (*frames, N_QVEL)),
+        "gt_reward": (np.float32, frames),
+        "gt_success": (np.bool_, frames),
+        "seed": (np.int64, (n,)),
+        "level": number,
+        "stop_at": number,
+        "speed": number,
+    }
 
 
 def remove_parts(behaviour: Behaviour) -> None:

@@ -13,11 +13,23 @@ LARGEST = {"noise_max": 2.0, "stop_share": 1.0, "slow_max": 0.9, "bias_max": 1.0
 """Largest values of the expert's flaws, any of which can be calibrated."""
 
 
+MAX_EPISODES = 1_000_000
+"""75 GB, all of which are in memory when they are written, and 75 hours on one core."""
+
+
 def check_flaws(flaws: Mapping[str, float]) -> None:
     """Check that values are in [0, `LARGEST`]; raises `BadInput`."""
     for name, value in flaws.items():
         if not 0 <= value <= LARGEST[name]:
             raise BadInput(f"{name} must be in [0, {LARGEST[name]}], got {value}")
+
+
+def check_n_episodes(n_episodes: int) -> None:
+    """Check that a number of episodes is in [1, `MAX_EPISODES`]; raises `BadInput`."""
+    if n_episodes < 1:
+        raise BadInput(f"n-episodes must be at least 1, got {n_episodes}")
+    if n_episodes > MAX_EPISODES:
+        raise BadInput(f"n-episodes must be at most {MAX_EPISODES}, got {n_episodes}; collect several datasets")
 
 
 @dataclass(frozen=True)
@@ -46,8 +58,7 @@ class CollectConfig:
     """Id of the new Minari dataset; {task} stands for the task."""
 
     def __post_init__(self) -> None:
-        if self.n_episodes < 1:
-            raise BadInput(f"n-episodes must be at least 1, got {self.n_episodes}")
+        check_n_episodes(self.n_episodes)
         if not 0 < self.level <= 100:
             raise BadInput(f"level must be in (0, 100] percent of the expert, got {self.level}")
         if self.seed < 0:

@@ -63,5 +63,5 @@ def ensure_videos(
         ZestError: a process died; finished videos are kept.
     """
     jobs = {str(path): video for path, video in missing(videos).items()}
-    for _ in run_jobs(write_video, jobs, n_workers=n_workers):
+    for _ in run_jobs(write_video, jobs, n_workers=n_workers, stage="drawing videos"):
         on_done()

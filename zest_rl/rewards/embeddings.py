@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.embedders import Embedder, Precision, load_embedder
-from zest_rl.errors import BadInput
+from zest_rl.errors import BadInput, ZestError
 from zest_rl.types import FloatArray
+
+N_CHECKED = 3
+"""Cached embeddings that a run computes again."""
+TOLERANCE = 0.03
+"""Largest distance of an embedding from the same one computed again, in units of its length. One machine agrees to
+1e-6, another device within about 0.01; the same view with a part moved is 0.4 away."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +58,24 @@ class EpisodeEmbeddings(Protocol):
 
     def __iter__(self) -> Iterator[EmbeddedEpisode]:
         """Read the cache, one episode in memory at a time."""
+
+
+def check_equal(folder: Path, pairs: Iterable[tuple[FloatArray | None, FloatArray]]) -> None:
+    """Compare embeddings (…, D) of a cache with the same ones computed again; None: was damaged.
+
+    Raises:
+        ZestError: they differ by more than `TOLERANCE`; nothing is deleted, because either may be right.
+    """
+    for cached, computed in pairs:
+        if cached is None:
+            continue
+        off = np.linalg.norm(cached - computed, axis=-1) / np.linalg.norm(computed, axis=-1)
+        if not (off <= TOLERANCE).all():
+            raise ZestError(
+                f"embeddings in the cache {folder} are not those that this machine computes: one is off by "
+                f"{off.max():.0%} of its length. Its files were exchanged, or made with another GL driver or device; "
+                "delete that folder, then run the same command again"
+            )
 
 
 @functools.lru_cache(maxsize=2)

@@ -6,7 +6,8 @@ run resumes at the episode where it stopped.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import random
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -17,14 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.embedders import Precision
-from zest_rl.errors import BadInput, ZestError
-from zest_rl.rewards.embeddings import EmbeddedEpisode, WorkerEmbedder, shared_embedder
+from zest_rl.errors import BadInput
+from zest_rl.rewards.embeddings import N_CHECKED, EmbeddedEpisode, WorkerEmbedder, check_equal, shared_embedder
 from zest_rl.runtime import artifacts
-from zest_rl.runtime.arrays import read_arrays
-from zest_rl.runtime.parallel import Engine, cached_jobs, one_thread
+from zest_rl.runtime.arrays import Layout, read_arrays, write_arrays
+from zest_rl.runtime.cache import cache_folder
+from zest_rl.runtime.parallel import Engine, cached_jobs, one_thread, run_jobs
 from zest_rl.sources.base import EpisodeFrames, Source
+from zest_rl.types import FloatArray
 
 STEPS_PER_BATCH = 16
+CHECKED_STEPS = 256
+"""The frames that are embedded again and compared are among the first of an episode: a video is decoded in order."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,7 @@ class _Job:
     n_steps: int
 
 
-def _embed_episode(shared: _Shared, job: _Job) -> dict[str, NDArray[np.generic]]:
+def _embed_episode(shared: _Shared, job: _Job) -> dict[str, NDArray[Any]]:
     embedder = shared.embedder.load()
     steps = islice(shared.frames.read(job.episode), job.n_steps + 2)  # one more than allowed, to notice too many
     parts = []
@@ -59,6 +64,13 @@ def _embed_episode(shared: _Shared, job: _Job) -> dict[str, NDArray[np.generic]]
             f"{job.n_steps} without the last; got {number}. Are these the frames of this episode, one for each step?"
         )
     return {"embeddings": np.concatenate(parts)}
+
+
+def _embed_frame(shared: _Shared, place: tuple[int, int]) -> FloatArray:
+    """Embed one frame, (episode, step), of all views: (V, D)."""
+    episode, step = place
+    with one_thread():
+        return shared.embedder.load().embed_images(list(next(islice(shared.frames.read(episode), step, None))))
 
 
 class FrameEmbeddings:
@@ -84,12 +96,13 @@ class FrameEmbeddings:
         Raises:
             BadInput: frames or the embedder cannot be read.
         """
-        fingerprint = shared_embedder(embedder, precision, device).fingerprint
-        self._shared = _Shared(source.frames, WorkerEmbedder(embedder, precision, device, fingerprint))
+        network = shared_embedder(embedder, precision, device)
+        self._shared = _Shared(source.frames, WorkerEmbedder(embedder, precision, device, network.fingerprint))
+        self._layout: Layout = {"embeddings": (np.float32, (None, None, network.dim))}
         self._source, self._n_workers, self._engine = source, n_workers, engine
         self._n_steps = source.trajectories.n_steps
         self._digests = [source.frames.digest(episode) for episode in range(len(self._n_steps))]
-        self._folder: Path = artifacts.cache_dir() / "frames" / fingerprint[:20]
+        self._folder: Path = cache_folder("frames", network.fingerprint[:20])
         self.n_embedded = 0
         """Episodes that were not in the cache."""
 
@@ -103,47 +116,62 @@ class FrameEmbeddings:
         return {"frames": self._source.frames.describe(), "frames_sha256": artifacts.hash_json(self._digests)}
 
     def embed(self, on_progress: Callable[[int, int], None] | None = None) -> None:
-        """Embed the episodes that are not in the cache.
+        """Embed the episodes that are not in the cache, after a few frames of those that are, to compare.
 
         Args:
             on_progress: called with (episodes embedded, episodes in all).
 
         Raises:
             BadInput: frames cannot be read, or an episode has neither T nor T+1 of them.
-            ZestError: a worker process died; finished episodes are kept.
+            ZestError: a worker process died; finished episodes are kept. Or the cache holds other embeddings.
         """
-        jobs = {
-            self._path(digest).stem: _Job(i, self._n_steps[i])
-            for i, digest in enumerate(self._digests)
-            if not self._path(digest).exists()
-        }
-        work, n_cached = partial(_embed_episode, self._shared), len(self._digests) - len(jobs)
         options: dict[str, Any] = {
-            "n_workers": self._n_workers, "engine": self._engine, "device": self._shared.embedder.device,
+            "engine": self._engine, "device": self._shared.embedder.device, "stage": "reading and embedding frames",
         }  # fmt: skip
+        cached = [i for i in range(len(self._digests)) if self._read(i) is not None]
+        self._check(random.sample(cached, min(N_CHECKED, len(cached))), options)
+        missing = set(range(len(self._digests))) - set(cached)
+        jobs = {self._path(i).stem: _Job(i, self._n_steps[i]) for i in sorted(missing)}
+        work, n_cached = partial(_embed_episode, self._shared), len(self._digests) - len(jobs)
+        options |= {"n_workers": self._n_workers, "layout": lambda job: self._layout}
         for n_done, _ in enumerate(cached_jobs(work, jobs, self._folder, **options), start=n_cached + 1):
             if on_progress is not None:
                 on_progress(n_done, len(self._digests))
         self.n_embedded += len(jobs)
 
+    def _check(self, episodes: Sequence[int], options: Mapping[str, Any]) -> None:
+        """Embed a frame of each of these episodes, which are in the cache, and compare; raises as `check_equal`."""
+        cached, places = {}, {}
+        for i in episodes:
+            if (vectors := self._read(i)) is not None and len(vectors) > 0:
+                step = random.randrange(min(len(vectors), self._n_steps[i], CHECKED_STEPS))
+                cached[str(i)], places[str(i)] = vectors[step], (i, step)
+        again = run_jobs(partial(_embed_frame, self._shared), places, n_workers=1, **options)
+        check_equal(self._folder, ((cached[name], vectors) for name, vectors in again))
+
     def __iter__(self) -> Iterator[EmbeddedEpisode]:
         """Read the cache; a missing x_T repeats x_{T-1}.
 
+        What turns out to be damaged is embedded again, in this process.
+
         Raises:
             BadInput: an episode has neither T nor T+1 frames.
-            ZestError: a file of the cache is damaged.
         """
-        for i, (digest, n_steps) in enumerate(zip(self._digests, self._n_steps, strict=True)):
-            arrays = read_arrays(self._path(digest))
-            if arrays is None:
-                self._path(digest).unlink(missing_ok=True)
-                raise ZestError(f"the embeddings of episode {i} in the cache are damaged; run the same command again")
-            frames = arrays["embeddings"]
+        for i, n_steps in enumerate(self._n_steps):
+            frames = self._read(i)
+            if frames is None:
+                arrays = _embed_episode(self._shared, _Job(i, n_steps))
+                write_arrays(self._path(i), arrays)
+                frames = arrays["embeddings"]
             if len(frames) not in (n_steps, n_steps + 1):
                 raise BadInput(f"episode {i} has {n_steps} actions and {len(frames)} frames")
             if len(frames) == n_steps:
                 frames = np.concatenate([frames, frames[-1:]])
             yield EmbeddedEpisode(frames, np.arange(n_steps + 1))
 
-    def _path(self, digest: str) -> Path:
-        return self._folder / f"{digest[:32]}.npz"
+    def _read(self, episode: int) -> FloatArray | None:
+        arrays = read_arrays(self._path(episode), self._layout)
+        return None if arrays is None else arrays["embeddings"]
+
+    def _path(self, episode: int) -> Path:
+        return self._folder / f"{self._digests[episode][:32]}.npz"

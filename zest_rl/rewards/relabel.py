@@ -186,6 +186,7 @@ def relabel_source(
     with artifacts.lock(path):
         if reader.exists(target_id):  # an equal call that ran at the same time
             return existing()
+        scorer.check_goal(device)
         embeddings.embed(on_progress)
         kept = scorer.goals_near(embeddings) if config.goal_share < 1 else None
         scorer = scorer if kept is None else scorer.with_goals(kept)

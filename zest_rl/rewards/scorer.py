@@ -7,7 +7,8 @@ file (the goal's embeddings) with its config, so that the goal pictures are not 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+import random
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -19,7 +20,7 @@ from zest_rl.data.provenance import ScorerRecord
 from zest_rl.embedders import Embedder, Precision
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen.views import Views
-from zest_rl.rewards.embeddings import EmbeddedEpisode, shared_embedder
+from zest_rl.rewards.embeddings import EmbeddedEpisode, check_equal, shared_embedder
 from zest_rl.rewards.goals import GoalSpec, embed_goal
 from zest_rl.rewards.scores import (
     NUMBERS,
@@ -32,6 +33,7 @@ from zest_rl.rewards.scores import (
 )
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_arrays, write_arrays
+from zest_rl.runtime.cache import cache_folder
 from zest_rl.runtime.parallel import one_thread
 from zest_rl.types import FloatArray
 
@@ -84,6 +86,17 @@ class Scorer:
         embedder = shared_embedder(config.embedder, config.precision, device)
         starts, goals = embed_goal_cached(goal, embedder)
         return cls(config, starts, goals, goal.fingerprint(), embedder.fingerprint, views, goal)
+
+    def check_goal(self, device: str) -> None:
+        """Embed a start and a goal again, and compare, because they may be from the cache; raises as `check_equal`."""
+        if self.goal is None:
+            return
+        embedder = shared_embedder(self.config.embedder, self.config.precision, device)
+        i, k = (random.randrange(len(some)) for some in (self.goal.starts, self.goal.goals))
+        one = replace(self.goal, starts=self.goal.starts[i : i + 1], goals=self.goal.goals[k : k + 1])
+        with one_thread():
+            start, goal = embed_goal(one, embedder)
+        check_equal(cache_folder("goals"), [(self.starts[i], start[0]), (self.goals[k], goal[0])])
 
     def score(self, embeddings: FloatArray) -> FloatArray:
         """Score frames of one episode: (n, V, D) embeddings, the first of x_0 → (n,) float32."""
@@ -214,8 +227,12 @@ def embed_goal_cached(goal: GoalSpec, embedder: Embedder) -> tuple[FloatArray, F
             "reads text, e.g. open_clip:ViT-B-32/openai, or a goal of pictures"
         )
     digest = artifacts.hash_json([goal.fingerprint(), embedder.fingerprint])
-    path = artifacts.cache_dir() / "goals" / f"{digest[:20]}.npz"
-    cached = read_arrays(path)
+    path = cache_folder("goals") / f"{digest[:20]}.npz"
+
+    def form(pictures: Sequence[Any]) -> tuple[type[np.float32], tuple[int, ...]]:
+        return np.float32, (len(pictures), *((1,) if goal.per_view else ()), embedder.dim)
+
+    cached = read_arrays(path, {"starts": form(goal.starts), "goals": form(goal.goals)})
     if cached is None:
         with one_thread():
             starts, goals = embed_goal(goal, embedder)

@@ -5,12 +5,18 @@ everything that an embedding depends on. Any process may add shards; each is wri
 
 One state is one batch of V frames on one thread, so that its embedding does not depend on the states embedded with it:
 networks are exact only up to about 1e-6 across batch sizes and thread counts.
+
+A digest tells a damaged shard from a whole one, which holds what another process computed, perhaps with another GL
+driver. So the first time that embeddings of recorded states are taken from the cache, and at the first new state of a
+rollout, a few are computed again and compared. The default network costs 2 s to load where a run needs no other
+embedding; that is little beside a dataset of wrong rewards.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+import random
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,12 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.embedders import Precision
-from zest_rl.errors import ZestError
+from zest_rl.kitchen.scene import N_QPOS
 from zest_rl.kitchen.views import Views, canonical_states, distinct_states
-from zest_rl.rewards.embeddings import EmbeddedEpisode, WorkerEmbedder, shared_embedder
+from zest_rl.rewards.embeddings import N_CHECKED, EmbeddedEpisode, WorkerEmbedder, check_equal, shared_embedder
 from zest_rl.runtime import artifacts
-from zest_rl.runtime.arrays import read_array, write_arrays
-from zest_rl.runtime.parallel import Engine, cached_jobs, chunks, one_thread
+from zest_rl.runtime.arrays import Layout, read_arrays, write_arrays
+from zest_rl.runtime.cache import cache_folder
+from zest_rl.runtime.parallel import Engine, cached_jobs, chunks, one_thread, run_jobs
 from zest_rl.simulation.views import state_keys
 from zest_rl.types import FloatArray
 
@@ -50,9 +57,10 @@ def _embed_states(job: _Job) -> dict[str, NDArray[np.generic]]:
 
 
 @functools.lru_cache(maxsize=SHARDS_IN_MEMORY)
-def _read_shard(path: Path) -> FloatArray | None:
+def _read_shard(path: Path, n_views: int, dim: int) -> FloatArray | None:
     """Return the embeddings of a shard, which never changes; None when it is missing or damaged."""
-    return read_array(path, "embeddings")
+    arrays = read_arrays(path, {"embeddings": (np.float32, (None, n_views, dim))})
+    return None if arrays is None else arrays["embeddings"]
 
 
 class StateEmbedder:
@@ -69,26 +77,30 @@ class StateEmbedder:
         engine: Engine = "local",
     ) -> None:
         """Open the cache (created when something is first written); arguments as in `FrameEmbeddings`."""
-        fingerprint = shared_embedder(embedder, precision, device).fingerprint
-        self.views, self.embedder = views, WorkerEmbedder(embedder, precision, device, fingerprint)
+        network = shared_embedder(embedder, precision, device)
+        self.views, self.embedder = views, WorkerEmbedder(embedder, precision, device, network.fingerprint)
         self.n_workers, self.engine = n_workers, engine
         self.n_embedded = 0
         """States that were not in the cache."""
-        digest = artifacts.hash_json([views.fingerprint(), fingerprint])
-        self.folder: Path = artifacts.cache_dir() / "embeddings" / digest[:20]
+        digest = artifacts.hash_json([views.fingerprint(), network.fingerprint])
+        self.folder: Path = cache_folder("embeddings", digest[:20])
+        self._form = (views.n_views, network.dim)
         self._where: dict[bytes, tuple[Path, int]] = {}
         """State → its shard, and the row in it."""
         self._new: dict[bytes, FloatArray] = {}
         """Results of `embed_now` that are not in a shard yet."""
         self._read: set[Path] = set()
+        self._checked = False
         self._index_shards()
 
     def _index_shards(self) -> None:
-        """Index the states of new shards; a damaged shard is ignored."""
-        for path in sorted(self.folder.glob("*.npz")):
-            if path not in self._read and (keys := read_array(path, "keys")) is not None:
-                self._where.update((key, (path, row)) for row, key in enumerate(state_keys(keys)))
-                self._read.add(path)
+        """Index the states of new shards; a damaged shard is removed."""
+        for path in sorted(set(self.folder.glob("*.npz")) - self._read):
+            if (arrays := read_arrays(path, {"keys": (np.float64, (None, N_QPOS))})) is None:
+                path.unlink(missing_ok=True)
+                continue
+            self._where.update((key, (path, row)) for row, key in enumerate(state_keys(arrays["keys"])))
+            self._read.add(path)
 
     def embed(self, qpos: NDArray[np.float64], on_progress: Callable[[int, int], None] | None = None) -> None:
         """Embed the states that are not in the cache, on all cores.
@@ -98,6 +110,7 @@ class StateEmbedder:
             on_progress: called with (shards done, shards in all).
         """
         states = distinct_states(qpos, self.views)  # in the order of the episodes: an episode needs few shards
+        self._check(state_keys(states))
         missing = states[[key not in self._where for key in state_keys(states)]]
         if len(missing) == 0:
             return
@@ -105,7 +118,7 @@ class StateEmbedder:
         for chunk in chunks(len(missing), STATES_PER_SHARD):
             part = missing[chunk.start : chunk.stop]
             jobs[artifacts.hash_arrays(part)[:20]] = _Job(self.views, self.embedder, part)
-        options: dict[str, Any] = {"n_workers": self.n_workers, "engine": self.engine, "device": self.embedder.device}
+        options = {**self._options, "n_workers": self.n_workers, "layout": self._layout}
         for n_done, _ in enumerate(cached_jobs(_embed_states, jobs, self.folder, **options), start=1):
             if on_progress is not None:
                 on_progress(n_done, len(jobs))
@@ -115,17 +128,13 @@ class StateEmbedder:
     def embedded(self, qpos: NDArray[np.float64]) -> EmbeddedEpisode:
         """Read the embeddings of one episode, (T+1, nq) simulator positions; a few shards are in memory at a time.
 
-        Raises:
-            ZestError: a file of the cache is damaged.
+        What turns out to be damaged is embedded again, in this process.
         """
         states, inverse = np.unique(canonical_states(qpos, self.views), axis=0, return_inverse=True)
-        rows = []
-        for key in state_keys(states):
-            if (row := self._row(key)) is None:
-                raise ZestError(f"embeddings in {self.folder} are missing or damaged; run the same command again")
-            rows.append(row)
+        rows = self.embed_now(states)
+        self.flush()
         inverse = np.asarray(inverse).reshape(-1)
-        return EmbeddedEpisode(np.stack([rows[inverse[0]], *rows]), 1 + inverse)
+        return EmbeddedEpisode(np.concatenate([rows[inverse[:1]], rows]), 1 + inverse)
 
     def _row(self, key: bytes) -> FloatArray | None:
         """Return the (V, D) embeddings of a state, or None; a damaged shard is removed and forgotten."""
@@ -134,7 +143,7 @@ class StateEmbedder:
         if key not in self._where:
             return None
         path, row = self._where[key]
-        if (embeddings := _read_shard(path)) is not None:
+        if (embeddings := _read_shard(path, *self._form)) is not None and row < len(embeddings):
             return np.asarray(embeddings[row])
         path.unlink(missing_ok=True)
         _read_shard.cache_clear()
@@ -142,12 +151,31 @@ class StateEmbedder:
         self._where = {other: place for other, place in self._where.items() if place[0] != path}
         return None
 
+    def _check(self, keys: Iterable[bytes]) -> None:
+        """Once, embed a few of the states of these keys that are in the cache, and compare; raises as `check_equal`."""
+        known = [] if self._checked else [key for key in keys if key in self._where]
+        cached = {key: self._row(key) for key in random.sample(known, min(N_CHECKED, len(known)))}
+        if not cached:
+            return
+        self._checked = True
+        states = np.stack([np.frombuffer(key) for key in cached])
+        ((_, arrays),) = run_jobs(_embed_states, {"check": _Job(self.views, self.embedder, states)}, **self._options)
+        check_equal(self.folder, zip(cached.values(), arrays["embeddings"], strict=True))
+
+    @property
+    def _options(self) -> dict[str, Any]:
+        return {"engine": self.engine, "device": self.embedder.device, "stage": "rendering and embedding"}
+
+    def _layout(self, job: _Job) -> Layout:
+        return {"keys": (np.float64, job.states.shape), "embeddings": (np.float32, (len(job.states), *self._form))}
+
     def embed_now(self, qpos: NDArray[np.float64]) -> FloatArray:
         """Embed states in this process, for use within a rollout: (N, nq) → (N, V, D). Call `flush` at the end."""
         states = canonical_states(qpos, self.views)
         rows = []
         for state, key in zip(states, state_keys(states), strict=True):
             if (row := self._row(key)) is None:
+                self._check(self._where)
                 job = _Job(self.views, self.embedder, state[None])
                 self._new[key] = row = np.asarray(_embed_states(job)["embeddings"][0], np.float32)
                 self.n_embedded += 1
@@ -156,6 +184,8 @@ class StateEmbedder:
 
     def flush(self) -> None:
         """Write the results of `embed_now` to the cache."""
+        if not self._new:
+            return
         keys, rows = list(self._new), list(self._new.values())
         for part in chunks(len(keys), STATES_PER_SHARD):
             states = np.stack([np.frombuffer(key) for key in keys[part.start : part.stop]])

@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import multiprocessing
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -15,6 +16,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal, get_args
@@ -23,18 +25,30 @@ from numpy.typing import NDArray
 
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime import ray_engine
-from zest_rl.runtime.arrays import Arrays, concatenate, read_arrays, write_arrays
+from zest_rl.runtime.arrays import Arrays, Layout, concatenate, read_arrays, write_arrays
 from zest_rl.runtime.ray_engine import Job, Result
 
 Engine = Literal["local", "ray"]
 """Processes of this machine, or workers of a Ray cluster (`zest_rl.runtime.ray_engine`)."""
 _STARTING = threading.Lock()
+WORKERS_PER_CORE, MAX_ACTORS = 16, 4096
+"""Most workers of this machine, and of a cluster; more can only exhaust memory and process table."""
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def n_cores() -> int:
     """Return the number of CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def cause_of_death(exit_code: int | None) -> str:
+    """Say what ended a child process that had not finished: the signal, and what usually sends it."""
+    if exit_code is None or exit_code >= 0:
+        return f"exit code {exit_code}"
+    name = signal.Signals(-exit_code).name
+    if exit_code in (-signal.SIGSEGV, -signal.SIGBUS, -signal.SIGABRT, -signal.SIGILL, -signal.SIGFPE):
+        return f"{name}: a native library crashed, such as GL, HDF5 or CUDA, often for want of memory or disk"
+    return f"{name}: killed, or out of memory"
 
 
 def die_with_parent() -> None:
@@ -91,6 +105,7 @@ def run_jobs(
     n_workers: int | None = None,
     engine: Engine = "local",
     device: str = "cpu",
+    stage: str = "the work",
 ) -> Iterator[tuple[str, Result]]:
     """Yield the name and the result of ``work(job)`` for every job, in the order in which they finish.
 
@@ -102,19 +117,23 @@ def run_jobs(
         n_workers: number of workers, default one per core.
         engine: local processes or Ray.
         device: of the work; Ray assigns GPUs by it.
+        stage: what is done, for the message when a worker died.
 
     Raises:
-        BadInput: `n_workers` is below 1, or there is no such engine.
-        ZestError: a worker died (out of memory, killed).
+        BadInput: `n_workers` is below 1 or too large, or there is no such engine.
+        ZestError: a worker died (out of memory, killed, a crash of a native library).
     """
-    if n_workers is not None and n_workers < 1:
-        raise BadInput(f"the number of workers must be at least 1, got {n_workers}; leave it out for one per core")
     if engine not in get_args(Engine):
         raise BadInput(f"unknown engine {engine!r}; {nearest(engine, get_args(Engine))}")
+    most = WORKERS_PER_CORE * n_cores() if engine == "local" else MAX_ACTORS
+    if n_workers is not None and not 1 <= n_workers <= most:
+        raise BadInput(
+            f"the number of workers must be between 1 and {most} here, got {n_workers}; leave it out for one per core"
+        )
     if engine == "ray":
-        yield from ray_engine.run_jobs(work, jobs, n_workers=n_workers, device=device)
+        yield from ray_engine.run_jobs(work, jobs, n_workers=n_workers, device=device, stage=stage)
     elif (n_processes := min(n_workers or n_cores(), len(jobs))) > 1:
-        yield from _run_in_pool(work, jobs, n_processes)
+        yield from _run_in_pool(work, jobs, n_processes, stage)
     else:
         for name, job in jobs.items():
             yield name, work(job)
@@ -134,25 +153,29 @@ def _do(job: Any) -> Any:
 
 
 def _run_in_pool(
-    work: Callable[[Job], Result], jobs: Mapping[str, Job], n_processes: int
+    work: Callable[[Job], Result], jobs: Mapping[str, Job], n_processes: int, stage: str
 ) -> Iterator[tuple[str, Result]]:
     waiting = iter(jobs.items())
     running: dict[Future[Result], str] = {}  # at most one per process: a pool finishes every job submitted to it
     context = multiprocessing.get_context("spawn")  # fork is unsafe beside torch's and the GL library's threads
+    others, workers = set(multiprocessing.active_children()), set[BaseProcess]()
     with ProcessPoolExecutor(n_processes, context, _start_worker, (work,)) as pool:
         try:
             while True:
                 with starting_children():  # submitting starts them
                     for name, job in itertools.islice(waiting, n_processes - len(running)):
                         running[pool.submit(_do, job)] = name
+                workers |= set(multiprocessing.active_children()) - others
                 if not running:
                     return
                 done = next(as_completed(running))
                 yield running.pop(done), done.result()
         except BrokenProcessPool as error:
+            codes = [worker.exitcode for worker in workers]
+            first = next((code for code in codes if code not in (None, 0, -signal.SIGTERM)), None)  # ends the others
             raise ZestError(
-                f"a worker process died before all of {len(jobs)} parts were done (killed, or out of memory); "
-                "finished parts are kept, run the same command again to go on"
+                f"a worker process died in {stage} before all of {len(jobs)} parts were done "
+                f"({cause_of_death(first)}); finished parts are kept, run the same command again to go on"
             ) from error
 
 
@@ -164,6 +187,8 @@ def cached_jobs(
     n_workers: int | None = None,
     engine: Engine = "local",
     device: str = "cpu",
+    stage: str = "the work",
+    layout: Callable[[Job], Layout] | None = None,
 ) -> Iterator[str]:
     """Write the arrays of ``work(job)`` to ``folder/NAME.npz`` for every job, and yield its name when they are there.
 
@@ -171,18 +196,21 @@ def cached_jobs(
     must depend on nothing else. Local workers write their results, so that nothing is lost with this process; workers
     of a cluster may have other disks, so this process writes.
 
+    `layout` returns the arrays that a job's file must hold: then the folder is a cache, whose damaged files are made
+    again. Without it files of versions that wrote no digests are finished, too: they belong to runs, which keep them.
+
     Raises:
-        BadInput: `n_workers` is below 1, or there is no such engine.
-        ZestError: a worker died (out of memory, killed); finished jobs are kept.
+        BadInput: as in `run_jobs`.
+        ZestError: a worker died; finished jobs are kept.
     """
     missing = {}
     for name, job in jobs.items():
-        if read_arrays(folder / f"{name}.npz") is None:
+        if _read_part(folder, name, None if layout is None else layout(job)) is None:
             missing[name] = (name, job)
         else:
             yield name
     do = partial(_do_named, work, None if engine == "ray" else folder)
-    for name, arrays in run_jobs(do, missing, n_workers=n_workers, engine=engine, device=device):
+    for name, arrays in run_jobs(do, missing, n_workers=n_workers, engine=engine, device=device, stage=stage):
         if arrays is not None:
             write_arrays(folder / f"{name}.npz", arrays)
         yield name
@@ -203,13 +231,19 @@ def chunks(n: int, size: int) -> list[range]:
     return [range(start, min(start + size, n)) for start in range(0, n, size)]
 
 
-def read_parts(folder: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """Read the files of `cached_jobs` for these jobs, joined along the first axis.
+def read_parts(
+    folder: Path, names: Iterable[str], layouts: Mapping[str, Layout] | None = None
+) -> dict[str, NDArray[Any]]:
+    """Read the files of `cached_jobs` for these jobs, joined along the first axis; `layouts` by name, or none.
 
     Raises:
         ZestError: a part is missing or damaged.
     """
-    parts = {name: read_arrays(folder / f"{name}.npz") for name in names}
+    parts = {name: _read_part(folder, name, None if layouts is None else layouts[name]) for name in names}
     if missing := [name for name, part in parts.items() if part is None]:
         raise ZestError(f"parts of {folder} are missing or damaged ({', '.join(missing)}); run the command again")
     return concatenate([part for part in parts.values() if part is not None])
+
+
+def _read_part(folder: Path, name: str, layout: Layout | None) -> dict[str, NDArray[Any]] | None:
+    return read_arrays(folder / f"{name}.npz", layout, undigested=layout is None)

@@ -45,7 +45,12 @@ class _Worker:
 
 
 def run_jobs(
-    work: Callable[[Job], Result], jobs: Mapping[str, Job], *, n_workers: int | None = None, device: str = "cpu"
+    work: Callable[[Job], Result],
+    jobs: Mapping[str, Job],
+    *,
+    n_workers: int | None = None,
+    device: str = "cpu",
+    stage: str = "the work",
 ) -> Iterator[tuple[str, Result]]:
     """Yield the name and the result of ``work(job)`` for every job, in the order in which they finish.
 
@@ -95,7 +100,7 @@ def run_jobs(
                     yield name, result
         except RayError as error:
             raise ZestError(
-                f"Ray could not finish the work ({type(error).__name__}: {error}); finished parts are kept, run the "
+                f"Ray could not finish {stage} ({type(error).__name__}: {error}); finished parts are kept, run the "
                 "same command again to go on"
             ) from error
         finally:

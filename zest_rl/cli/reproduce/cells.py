@@ -113,7 +113,7 @@ def run_cells(cells: list[Cell], output: Path, ui: Ui, *, n_workers: int | None 
         ui.progress("updates of all cells (evaluation follows)", sum(n_updates.values())) as advance,
         _followed(n_updates.keys(), advance),
     ):
-        for name in cached_jobs(_train_and_evaluate, open_cells, done_folder, n_workers=n_workers):
+        for name in cached_jobs(_train_and_evaluate, open_cells, done_folder, n_workers=n_workers, stage="a cell"):
             ui.say(f"done: {name}")
     return len(open_cells)
 
@@ -195,5 +195,5 @@ def seconds_of(cell: Cell, output: Path) -> dict[str, float]:
 
     meta = artifacts.read_json(cell.run / "meta.json")
     times = {"train_seconds": meta["train_seconds"]} if "train_seconds" in meta else {}
-    times |= read_arrays(output / "done" / f"{cell.name}.npz") or {}
+    times |= read_arrays(output / "done" / f"{cell.name}.npz", undigested=True) or {}
     return {name: round(float(value), 3) for name, value in times.items()}
