@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import pytest
@@ -77,6 +78,37 @@ def test_a_run_s_description_and_a_dataset_s_metadata_are_read_alike() -> None:
 def test_a_record_of_another_program_is_named_with_its_dataset(relabel: Any) -> None:
     with pytest.raises(BadInput, match="the record of how zest/x-v0 was made is not ours"):
         DatasetRecord.from_metadata("zest/x-v0", {"zest": {"relabel": relabel}})
+
+
+@pytest.mark.parametrize(
+    ("metadata", "problem"),
+    [
+        ({"ref_min_score": "0"}, "ref_min_score must be float | None, got '0'"),
+        ({"ref_max_score": [70.0]}, "ref_max_score must be float"),
+        ({"ref_max_score": float("nan")}, "ref_max_score must be float"),
+        ({"ref_max_score": 10**400}, "ref_max_score must be float"),
+        ({"env_spec": 7}, "env_spec must be str | None, got 7"),
+        ({"env_spec": "[]"}, "env_spec must be an object with an object of kwargs"),
+        ({"env_spec": '{"kwargs": 1}'}, "env_spec must be an object with an object of kwargs"),
+        ({"env_spec": "[" * 100_000}, "RecursionError"),
+        ({"zest": []}, "AttributeError"),
+        ({"zest": None}, "AttributeError"),
+        ({"zest": {"collect": "x"}}, "ValueError"),
+        ({"zest": {"collect": {"asked": 3}}}, "asked must be Mapping"),
+        ({"zest": {"recorded": {"fps": "10"}}}, "fps must be float | None, got '10'"),
+        ({"zest": {"recorded": 10}}, "TypeError"),
+        ({"zest": {"relabel": {**KITCHEN, "source": 1}}}, "source must be str, got 1"),
+        ({"zest": {"relabel": {**KITCHEN, "reward": "both"}}}, "reward must be Literal"),
+        ({"zest": {"relabel": {**KITCHEN, "kept_goals": [0.5]}}}, "kept_goals must be tuple"),
+        ({"zest": {"relabel": {**KITCHEN, "shuffle": True}}}, "shuffle must be int | None, got True"),
+        ({"zest": {"relabel": {**PICTURES, "frames": {"views": []}}}}, "there must be 1 view or more"),
+        ({"zest": {"relabel": {**PICTURES, "frames": {}}}}, "KeyError: 'views'"),
+        ({"zest": {"relabel": {**PICTURES, "frames": None}}}, "KeyError: 'views'"),
+    ],
+)
+def test_a_value_of_another_type_is_named(metadata: dict[str, Any], problem: str) -> None:
+    with pytest.raises(BadInput, match=f"the record of how zest/x-v0 was made is not ours .*{re.escape(problem)}"):
+        DatasetRecord.from_metadata("zest/x-v0", metadata)
 
 
 def test_a_run_that_names_no_dataset_is_refused_and_an_empty_record_is_none() -> None:

@@ -244,6 +244,129 @@ def test_an_episode_without_steps_is_refused(collected: str) -> None:
         read(collected, Dataset.states)
 
 
+SIDE_ARRAYS = {
+    "infos/zest/score": Dataset.scores,
+    "infos/gt/reward": Dataset.truth,
+    "infos/gt/success": Dataset.truth,
+    "infos/source/reward": Dataset.source_rewards,
+    "infos/source/success": Dataset.successes,
+}
+
+
+@pytest.mark.parametrize(("name", "reads"), SIDE_ARRAYS.items())
+@pytest.mark.parametrize(
+    ("values", "rule"),
+    [
+        (np.zeros(97), r"must have T (\+ 1 = 101|= 100) rows, got shape \(97,\)"),
+        (np.zeros((97, 1)), "must have T"),
+        (np.full(101, np.nan), "must be finite, but 101 of 101 rows"),
+        (np.full(101, np.inf), "must be finite"),
+        (np.array([b"a"] * 101), "must hold numbers, got values of type"),
+        (np.float32(1), "must have T"),
+        (h5py.Empty("f4"), "must have T"),
+    ],
+    ids=["short", "short columns", "NaN", "infinite", "text", "one number", "nothing"],
+)
+def test_scores_truth_and_success_have_the_length_of_their_episode_and_are_finite(
+    name: str, reads: Callable[[Dataset], Any], values: Any, rule: str, collected: str
+) -> None:
+    with edited(collected) as file:
+        for i, episode in enumerate(file.values()):
+            if name in episode:
+                del episode[name]
+            episode[name] = values if i == 2 else np.zeros(101, np.float32)
+    if name == "infos/source/reward" and rule.startswith("must be finite"):
+        assert not np.isfinite(read(collected, reads)[2]).any(), "as the source had them"
+        return
+    with pytest.raises(BadInput, match=f"episode_2 of dataset {collected}: .*{rule}"):
+        read(collected, reads)
+
+
+def test_an_export_of_scores_of_another_length_is_refused(
+    collected: str, refusal: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    replace_array(collected, "episode_1/infos/gt/reward", lambda rewards: rewards[:97])
+    for kind in ("npz", "d4rl", "robomimic", "d3rlpy", "torchrl", "lerobot"):
+        code, error = refusal("export", collected, "--to", kind, "--output", tmp_path / kind)
+        assert (code, "infos/gt/reward must have T + 1 = 101 rows, got shape (97,)" in error) == (2, True)
+        assert not (tmp_path / kind).exists()
+
+
+@pytest.mark.parametrize("n_rows", [100, 101])
+def test_success_of_other_robots_is_of_steps_or_of_frames(n_rows: int, collected: str) -> None:
+    assert read(collected, Dataset.successes) is None
+    with edited(collected) as file:
+        for episode in file.values():
+            episode["infos/success"] = np.arange(n_rows) == n_rows - 1
+    assert [np.flatnonzero(success).tolist() for success in read(collected, Dataset.successes)] == [[99]] * 4
+
+
+@pytest.mark.parametrize(
+    ("name", "reads"),
+    [
+        ("observations", Dataset.episodes),
+        ("observations", Dataset.fingerprint),
+        ("actions", Dataset.episodes),
+        ("actions", Dataset.fingerprint),
+        ("infos/state/qpos", Dataset.states),
+    ],
+)
+def test_episodes_of_unequal_width_are_refused(name: str, reads: Callable[[Dataset], Any], collected: str) -> None:
+    replace_array(collected, f"episode_3/{name}", lambda values: values[:, :-1])
+    with pytest.raises(
+        BadInput, match=rf"the episodes of dataset {collected} must hold equally many numbers, got .* epis"
+    ):
+        read(collected, reads)
+
+
+@pytest.mark.parametrize("name", ["observations", "actions"])
+def test_what_training_would_refuse_is_refused_before_anything_is_embedded(
+    name: str, collected: str, refusal: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    replace_array(collected, f"episode_3/{name}", lambda values: np.where(values == values[50], np.nan, values))
+    code, error = refusal("relabel", collected)
+    assert (code, f"episode_3 of dataset {collected}: {name} must be finite" in error) == (2, True)
+    assert not (tmp_path / "cache").exists()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("total_episodes", 5),
+        ("total_episodes", "4"),
+        ("total_steps", 399),
+        ("total_steps", 10**12),
+        ("total_steps", None),
+    ],
+)
+def test_metadata_that_do_not_agree_with_the_arrays_are_told(key: str, value: Any, collected: str) -> None:
+    change_metadata(collected, **{key: value})
+    with pytest.raises(
+        BadInput, match=rf"has {key} {value}, but data/main_data.hdf5 holds 4.*or, if you changed it on"
+    ):
+        read(collected, Dataset.episodes)
+
+
+def test_steps_that_are_declared_but_not_stored_take_no_memory(collected: str) -> None:
+    with edited(collected) as file:
+        del file["episode_0/terminations"], file["episode_0/actions"]
+        file.create_dataset("episode_0/terminations", (10**12,), bool, chunks=(10,))
+        file.create_dataset("episode_0/actions", (10**12, 9), "f4", chunks=(10, 9))
+    change_metadata(collected, total_steps=10**12 + 300)
+    for reads in (Dataset.fingerprint, Dataset.episodes, Dataset.rewards, Dataset.states, Dataset.truth):
+        with pytest.raises(BadInput, match=r"episode_0 of dataset .* (must have T|of which 0 are stored)"):
+            read(collected, reads)
+
+
+@pytest.mark.parametrize("name", ["episode_0", "episode_0/observations"])
+def test_an_array_in_the_place_of_a_group_is_refused(name: str, collected: str) -> None:
+    with edited(collected) as file:
+        del file[name]
+        file[name] = np.zeros(3)
+    with pytest.raises(BadInput, match=r"has no 'terminations' in /episode_0|observations must have T"):
+        read(collected, Dataset.episodes)
+
+
 @pytest.mark.parametrize("name", ["observations", "actions", "rewards", "terminations"])
 def test_a_missing_array_is_named(collected: str, name: str) -> None:
     with edited(collected) as file:

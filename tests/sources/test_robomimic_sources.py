@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 from rollouts import LENGTHS, Episode, Run, check_imported, rows, write_robomimic
 
+from zest_rl.errors import BadInput, Notice
 from zest_rl.sources import open_source
 
 
@@ -42,6 +45,102 @@ def test_the_last_frame_repeats_where_next_obs_lacks_the_camera(maze: list[Episo
         del file["data/demo_1/next_obs/agentview_image"]
     frames = open_source(str(path)).frames
     assert [len(list(frames.read(i))) for i in range(len(maze))] == list(LENGTHS)
+
+
+def replace(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[h5py.Group], None]:
+    def spoil(demo: h5py.Group) -> None:
+        values = change(demo[name][()])
+        del demo[name]
+        demo[name] = values
+
+    return spoil
+
+
+def add(name: str, values: Any) -> Callable[[h5py.Group], None]:
+    return lambda demo: demo.__setitem__(name, values)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "rule"),
+    [
+        (replace("actions", lambda a: np.where(a == a[1], np.nan, a)), "actions must be finite, but 1 of 6 rows"),
+        (replace("obs/object", lambda a: a * np.nan), "object must be finite"),
+        (replace("obs/object", lambda a: a[:-1]), "obs/object must have T = 6 rows, got shape (5, 2)"),
+        (replace("obs/agentview_image", lambda a: a[:-1]), "obs/agentview_image must have T = 6 rows, got shape (5, "),
+        (replace("next_obs/object", lambda a: a[:-1]), "next_obs/object must have T = 6 rows"),
+        (
+            replace("next_obs/object", lambda a: a[:, :1]),
+            "next_obs/object must have the shape of /data/demo_1/obs/object",
+        ),
+        (
+            replace("obs/object", lambda a: np.array([[b"a"] * 2] * 6)),
+            "obs/object has none per step here, but 2 in data/demo_0",
+        ),
+        (replace("actions", lambda a: np.array([b"a"] * 6)), "actions must hold numbers, got values of type |S1"),
+        (replace("actions", lambda a: a[:, :1]), "actions has 1 per step here, but 2 in data/demo_0"),
+        (replace("rewards", lambda a: a[:-1]), "rewards must have T = 6 rows"),
+        (replace("rewards", lambda a: np.stack([a, a], axis=1)), "rewards (6, 2)"),
+        (replace("dones", lambda a: a[:-1]), "dones must have T = 6 rows"),
+        (add("obs/extra", np.zeros((6, 14))), "obs/extra has 14 per step here, but none in data/demo_0"),
+        (lambda demo: demo.__delitem__("obs/object"), "obs/object has none per step here, but 2 in data/demo_0"),
+    ],
+)
+def test_a_demo_that_breaks_a_rule_is_named_before_anything_is_embedded(
+    spoil: Callable[[h5py.Group], None], rule: str, maze: list[Episode], goal: Path,
+    refusal: Callable[..., tuple[int, str]], tmp_path: Path,
+) -> None:  # fmt: skip
+    path = write_robomimic(tmp_path / "lift.hdf5", maze)
+    with h5py.File(path, "r+") as file:
+        spoil(file["data/demo_1"])
+    code, error = refusal("relabel", path, "--goal", goal, "--n-workers", "1")
+    assert (code, rule in error, "error: data/demo_1 of lift.hdf5: " in error) == (2, True, True), error
+    assert "del h5py.File('lift.hdf5', 'r+')['data/demo_1']" in error
+    assert not list((tmp_path / "minari").rglob("metadata.json"))
+    assert {path.name for path in tmp_path.glob("cache/*")} <= {"goals"}
+
+
+def test_takes_without_steps_are_left_out_and_told(maze: list[Episode], tmp_path: Path) -> None:
+    path = write_robomimic(tmp_path / "lift.hdf5", maze)
+    with h5py.File(path, "r+") as file:
+        file.create_group("data/demo_7").attrs["num_samples"] = 0
+        file["data/demo_8/actions"], file["data/demo_8/obs/object"] = np.zeros((0, 2)), np.zeros((0, 2))
+        file.move("data/demo_0", "data/demo_9")
+    with pytest.warns(Notice, match="left out, as they have no steps: data/demo_7, data/demo_8"):
+        source = open_source(str(path))
+    assert list(source.trajectories.n_steps) == [*LENGTHS[1:], LENGTHS[0]]
+
+
+def test_rewards_may_stand_in_a_column(maze: list[Episode], tmp_path: Path) -> None:
+    path = write_robomimic(tmp_path / "lift.hdf5", maze)
+    plain = open_source(str(path)).trajectories.rewards_to_keep()
+    with h5py.File(path, "r+") as file:
+        for demo in file["data"].values():
+            replace("rewards", lambda rewards: rewards[:, None])(demo)
+    for rewards, expected in zip(open_source(str(path)).trajectories.rewards_to_keep(), plain, strict=True):
+        np.testing.assert_array_equal(rewards, expected)
+
+
+def test_demos_of_other_names_are_told_how_to_be_renamed(
+    maze: list[Episode], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_robomimic(tmp_path / "lift.hdf5", maze)
+    with h5py.File(path, "r+") as file:
+        for name in list(file["data"]):
+            file["data"].move(name, name.replace("demo", "traj"))
+    with pytest.raises(
+        BadInput, match=r"named data/demo_0, data/demo_1, …, got data/traj_0 in .* rename them: `pyth"
+    ) as told:
+        open_source(str(path))
+    monkeypatch.chdir(tmp_path)
+    subprocess.run(["sh", "-c", str(told.value).split("`")[1].replace("python", sys.executable, 1)], check=True)
+    assert list(open_source(str(path)).trajectories.n_steps) == list(LENGTHS)
+
+
+def test_a_name_with_two_dots_becomes_an_id(maze: list[Episode], tmp_path: Path) -> None:
+    assert (
+        open_source(str(write_robomimic(tmp_path / "two..dots.hdf5", maze))).trajectories.dataset_id
+        == "zest/two-dots-v0"
+    )
 
 
 @pytest.mark.parametrize("dataset", ["/data/missing.hdf5", "~/missing", "./missing", "demos/missing.hdf5"])

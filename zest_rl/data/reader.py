@@ -203,8 +203,8 @@ class Dataset:
         def digest(group: h5py.Group) -> str:
             observed = self._observed(group)
             numeric = {path: entry for path, entry in observed.items() if is_numbers(entry)}
-            widths.append({path: entry.shape[1:] for path, entry in numeric.items()})
             arrays = [self._array(group, "actions", ndim=None), np.array([self._is_terminated(group)])]
+            widths.append({"actions": arrays[0].shape[1:], **{path: numeric[path].shape[1:] for path in numeric}})
             if _QPOS in group:
                 arrays.append(read_array(group[_QPOS], np.float64))
             parts = (
