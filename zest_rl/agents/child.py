@@ -33,13 +33,21 @@ TIMEOUT_VARIABLE, TIMEOUT = "ZEST_POLICY_TIMEOUT", 120.0
 GRACE = 5.0
 """Seconds that the process has after the end of stdin before it is killed."""
 MAX_ANSWER = 2**24  # bytes; a longer line is cut and fails to parse
-# The kernel ends the process with ours even if we are killed: a hanging process would not notice that stdin has ended.
-_START = """
-import ctypes, os, signal, sys
-if sys.platform == "linux":
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG, kept by exec
-if os.getppid() == int(sys.argv[1]):
-    os.execvp(sys.argv[2], sys.argv[2:])
+# A process between us and the command, in whose group are the command and whatever it starts. It kills the group when
+# our end of a pipe is closed, so also when we are killed: a hanging command would not notice that its stdin has ended.
+_GUARD = """
+import os, signal, subprocess, sys, threading
+def watch():
+    os.read(int(sys.argv[1]), 1)
+    os.killpg(0, signal.SIGKILL)
+threading.Thread(target=watch, daemon=True).start()
+command = subprocess.Popen(sys.argv[2:])
+os.close(0)
+os.close(1)
+code = command.wait()
+if code < 0:
+    os.kill(os.getpid(), -code)
+os._exit(abs(code))
 """
 
 
@@ -70,14 +78,17 @@ class PolicyProcess:
         """
         self.end()
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (`end` closes it)
+        watched, self._held = os.pipe()
         self._process = subprocess.Popen(
-            [sys.executable, "-I", "-S", "-c", _START, str(os.getpid()), *self._words],
+            [sys.executable, "-I", "-S", "-c", _GUARD, str(watched), *self._words],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
             env={**os.environ, **dict.fromkeys(THREAD_VARIABLES, "1")},  # results must not depend on the machine's load
             start_new_session=True,  # a new process group, which can be killed as a whole
+            pass_fds=[watched],
         )
+        os.close(watched)
         self._ask({"begin": {"n_episodes": n_episodes, **self._dims}}, "ready")
 
     def __call__(self, obs: FloatArray) -> Any:
@@ -99,6 +110,7 @@ class PolicyProcess:
             process.wait(GRACE)
         _kill(process)
         process.wait()
+        os.close(self._held)
         process.stdout.close()
         self._errors.close()
 

@@ -11,70 +11,43 @@ stdout carries the result, stderr everything else.
 
 from __future__ import annotations
 
-import importlib
 import os
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import redirect_stdout
-from types import ModuleType
-from typing import Any
+from collections.abc import Sequence
 
-from zest_rl import __version__
-from zest_rl.cli.config import parse_config
-from zest_rl.cli.notices import notices_by
-from zest_rl.cli.output import print_failure, print_result
-from zest_rl.cli.streams import print_in_any_encoding
-from zest_rl.cli.terminal import StreamUi
-from zest_rl.cli.verbs import HELP, VERBS, sub_verb_help
-from zest_rl.errors import BadInput, nearest
+from zest_rl.cli import streams
+from zest_rl.cli.interruption import interruptible
+
+BROKEN_PIPE = 141
+"""Exit code when nobody reads what is printed, as shells have it for SIGPIPE."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``zest`` with `argv` (default: the process's own arguments) and return its exit code."""
     # NumPy's threads beside busy workers make small products many times slower; it reads this when it is loaded
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    print_in_any_encoding()
+    streams.print_in_any_encoding()
     words = list(sys.argv[1:] if argv is None else argv)
+    with interruptible() as received:
+        try:
+            return _main(words, received)
+        except BrokenPipeError:
+            streams.drop_output()
+            return BROKEN_PIPE
+
+
+def _main(words: list[str], received: Sequence[int]) -> int:
     try:
-        return _dispatch(words)
+        from zest_rl.cli.dispatch import dispatch  # takes a moment, in which the command can be interrupted, too
+
+        code = dispatch(words)
     except SystemExit as stop:  # tyro has printed the help
-        return int(stop.code or 0)
+        code = int(stop.code or 0)
     except (Exception, KeyboardInterrupt) as error:
-        return print_failure(error, as_json="--json" in words)
+        if isinstance(error, BrokenPipeError) and not streams.are_read():
+            raise
+        from zest_rl.cli.output import print_failure
 
-
-def _dispatch(words: list[str]) -> int:
-    first, *rest = words or [""]
-    if not words or first in ("-h", "--help", "help"):
-        print(HELP, file=sys.stdout if words else sys.stderr)
-        return 0 if words else 2
-    if first == "--version":
-        print(f"zest {__version__}")
-        return 0
-    if first.startswith("-"):
-        raise BadInput(f"the verb comes first: zest VERB {first}; verbs: {', '.join(VERBS)}")
-    if first not in VERBS:
-        raise BadInput(f"unknown verb {first!r}; {nearest(first, VERBS)}")
-    return _run_verb(importlib.import_module(f"zest_rl.cli.{first}"), first, rest)
-
-
-def _run_verb(module: ModuleType, verb: str, words: list[str]) -> int:
-    config_class = getattr(module, "Config", None)
-    if config_class is None:
-        configs: Mapping[str, type[Any]] = module.CONFIGS
-        if words[:1] in (["-h"], ["--help"]):
-            print(sub_verb_help(verb, configs))
-            return 0
-        if not words or words[0] not in configs:
-            got = repr(words[0]) if words else "nothing"
-            raise BadInput(
-                f"`zest {verb}` needs a sub-verb first, got {got}; {nearest(words[0] if words else '', configs)}"
-            )
-        config_class, verb, words = configs[words[0]], f"{verb} {words[0]}", words[1:]
-    config, as_json = parse_config(config_class, words, verb)
-    ui = StreamUi()
-    with redirect_stdout(sys.stderr), notices_by(ui):  # whatever a library prints must not mix with the result
-        result: dict[str, Any] = module.run(config, ui)
-    if result:
-        print_result(result, getattr(module, "summary", None), as_json=as_json)
-    return 0 if result.get("ok", True) else 1
+        code = print_failure(KeyboardInterrupt(*received) if received else error, as_json="--json" in words)
+    print(end="", flush=True)
+    return code

@@ -10,11 +10,9 @@ import traceback
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from zest_rl.cli.interruption import INTERRUPTED, exit_code
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.training.distributed import launched
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C."""
 
 
 def print_result(
@@ -35,7 +33,7 @@ def print_failure(error: BaseException, *, as_json: bool) -> int:
     code, message = _explain(error)
     if os.environ.get("ZEST_TRACEBACK"):
         traceback.print_exc()
-    print(message if code == INTERRUPTED else f"error: {message}", file=sys.stderr)
+    print(message if isinstance(error, KeyboardInterrupt) else f"error: {message}", file=sys.stderr)
     if as_json and launched().leads:
         problem = {"type": type(error).__name__, "message": message, "exit_code": code}
         print(json.dumps({"error": problem}, indent=2))
@@ -67,7 +65,7 @@ def _cell(value: object) -> str:
 def _explain(error: BaseException) -> tuple[int, str]:
     """Return the exit code of a failure and what to tell the user."""
     if isinstance(error, KeyboardInterrupt):
-        return INTERRUPTED, "interrupted; run the same command again to go on"
+        return exit_code(error), INTERRUPTED
     if isinstance(error, ZestError):
         return 2 if isinstance(error, BadInput) else 1, str(error)
     if isinstance(error, OSError):

@@ -34,7 +34,8 @@ verbs (`zest VERB --help` lists the arguments of one):
 
 also: --help, --version
 
-exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted (run the same command again to go on)
+exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted by Ctrl-C and 143 by SIGTERM (run the same command again to
+go on; a second signal ends a command at once)
 
 examples:
   zest doctor

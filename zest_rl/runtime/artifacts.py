@@ -20,6 +20,7 @@ import shutil
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.errors import ZestError
+from zest_rl.errors import Notice, ZestError
 
 PACKAGES = (
     "torch", "torchvision", "timm", "open_clip_torch", "transformers", "gymnasium", "gymnasium-robotics", "mujoco",
@@ -248,7 +249,7 @@ def lock(target: Path) -> Iterator[None]:
         try:
             held.acquire(timeout=PATIENCE)
         except Timeout:
-            print(f"waiting for {path}, which another command holds until {target} is written", file=sys.stderr)
+            warnings.warn(f"waiting for {path}, which another command holds until {target} is written", Notice, 3)
             held.acquire()
     except OSError as error:
         raise _cannot_write(target, error) from error

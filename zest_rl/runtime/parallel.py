@@ -65,13 +65,15 @@ def die_with_parent() -> None:
 
 @contextmanager
 def starting_children() -> Iterator[None]:
-    """Make processes started within the context use one core each, and not run the caller's script again.
+    """Let processes started within the context use one core each, ignore Ctrl-C, and not run the caller's script again.
 
     With one core their results do not depend on the number of workers; set here and not in the child, because the
     libraries read it when they are loaded. A spawned process would import ``__main__``, which hangs if a script does
-    its work there without ``if __name__ == "__main__"``; our jobs do not need that import.
+    its work there without ``if __name__ == "__main__"``; our jobs do not need that import. Ctrl-C is a signal to all
+    processes of a terminal; it is this one that ends its children.
     """
     with _STARTING:
+        unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited; here it waits
         main = sys.modules["__main__"]
         before = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
         os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
@@ -83,6 +85,7 @@ def starting_children() -> Iterator[None]:
             for name in THREAD_VARIABLES:
                 del os.environ[name]
             os.environ.update(before)
+            signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)
 
 
 @contextmanager
@@ -177,6 +180,10 @@ def _run_in_pool(
                 f"a worker process died in {stage} before all of {len(jobs)} parts were done "
                 f"({cause_of_death(first)}); finished parts are kept, run the same command again to go on"
             ) from error
+        except (KeyboardInterrupt, GeneratorExit):
+            for worker in set(multiprocessing.active_children()) - others:  # the pool would wait for their jobs
+                worker.kill()
+            raise
 
 
 def cached_jobs(

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import signal
 import socket
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -123,7 +125,10 @@ def _cluster(n_workers: int | None) -> Iterator[None]:
         _join(address, options)
     else:
         os.environ.setdefault("RAY_worker_niceness", "0")  # as the local engine's processes; Ray's default is 15
+        on_sigterm = signal.getsignal(signal.SIGTERM)
         ray.init(address="local", num_cpus=n_workers, include_dashboard=False, **options)
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, on_sigterm)  # Ray ends the process at once, without a word
     try:
         yield
     finally:

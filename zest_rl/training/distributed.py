@@ -8,6 +8,8 @@ with those of one process up to rounding.
 from __future__ import annotations
 
 import os
+import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -119,6 +121,17 @@ def local_index() -> int:
     return int(os.environ.get("LOCAL_RANK", 0))
 
 
+def _die_with(parent: int) -> None:
+    """End this process when torchrun is killed: nothing else would end it."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 @contextmanager
 def process_group(device: torch.device) -> Iterator[Group]:
     """Join the processes that ``torchrun`` started while the context is open; a single process does nothing."""
@@ -126,6 +139,7 @@ def process_group(device: torch.device) -> Iterator[Group]:
     if group.size == 1:
         yield group
         return
+    _die_with(os.getppid())
     import torch
     import torch.distributed as dist
 
