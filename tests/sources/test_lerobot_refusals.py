@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -249,3 +252,17 @@ def test_a_video_that_lacks_a_frame_is_refused_rather_than_shifted(root: Path) -
     imageio.mimwrite(root / VIDEO, frames, fps=9, macro_block_size=2)
     with pytest.raises(BadInput, match=r"has no frame for step . of episode 1, .* info\.json says 10 per second"):
         check(root)
+
+
+def test_a_folder_of_any_name_is_read_in_any_locale(root: Path) -> None:
+    folder, plain = (
+        root.rename(root.parent / "кухня データ"),
+        {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"},
+    )
+    code = (
+        "import sys; from zest_rl.sources import open_source; source = open_source(sys.argv[1]); "
+        "print(source.trajectories.fingerprint(), len(list(source.frames.read(0))))"
+    )
+    words = [sys.executable, "-c", code, str(folder)]
+    done = subprocess.run(words, env=os.environ | plain, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [check(folder).trajectories.fingerprint(), "4"]

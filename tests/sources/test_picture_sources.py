@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import tracemalloc
 from collections.abc import Callable
@@ -28,6 +29,7 @@ from rollouts import (
 from zest_rl import cli
 from zest_rl.data import reader
 from zest_rl.data.reader import Dataset
+from zest_rl.sources import open_source
 from zest_rl.sources.pictures import Pictures
 
 
@@ -217,3 +219,23 @@ def test_numbers_alone_are_no_frames(maze: list[Episode], goal: Path, refusal: C
     blind = write_rollouts("maze/blind-v0", maze, lambda e: rows(e, "observation"))
     code, error = refusal("relabel", blind, "--goal", goal)
     assert (code, "shows no frames" in error) == (2, True)
+
+
+def test_a_wrapper_of_another_package_in_the_env_spec_does_not_matter_to_pictures(pictured: str) -> None:
+    path = reader.dataset_path(pictured) / reader.METADATA_FILE
+    wrapper = {"name": "Monitor", "entry_point": "of_another_package.monitor:Monitor", "kwargs": None}
+    spec = {"id": "HumanoidStandup-v5", "entry_point": "gymnasium.envs.mujoco.humanoidstandup_v5:HumanoidStandupEnv"}
+    metadata = json.loads(path.read_text()) | {"env_spec": json.dumps(spec | {"additional_wrappers": [wrapper]})}
+    path.write_text(json.dumps(metadata))
+    assert open_source(pictured, frames=["cameras/top"]).frames.views == ("observations/cameras/top",)
+
+
+def test_pictures_that_are_not_read_are_named_where_there_are_no_others(
+    maze: list[Episode], goal: Path, refusal: Callable[..., tuple[int, str]]
+) -> None:
+    deep = write_rollouts("maze/deep-v0", maze, lambda e: {"depth": np.stack(e.frames)[..., 0].astype(np.float32) * 9})
+    code, error = refusal("relabel", deep, "--goal", goal)
+    assert (
+        code,
+        "not read as pictures: observations/depth (float32 (64, 64) per step, but not in [0, 1]" in error,
+    ) == (2, True)

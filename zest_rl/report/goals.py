@@ -11,11 +11,12 @@ from zest_rl.analysis.reward_figures import true_returns
 from zest_rl.data.images import list_images, read_image
 from zest_rl.data.provenance import RelabelRecord
 from zest_rl.data.reader import Dataset
+from zest_rl.errors import BadInput
 from zest_rl.kitchen.tasks import get_task
 from zest_rl.metrics.reward_quality import returns_of
 from zest_rl.metrics.statistics import MIN_EPISODES_TO_RANK, Estimate, Values, spearman
 from zest_rl.report.content import GoalPanel, Scatter
-from zest_rl.rewards.goals import read_goal, read_text
+from zest_rl.rewards.goals import TASK_TEXT, TEXT, read_goal, read_text
 from zest_rl.rewards.relabel import GOAL_FOLDER
 
 
@@ -41,6 +42,9 @@ def goal_panel(name: str, record: RelabelRecord, folder: Path, scatter: Scatter 
         record: how the dataset was relabeled.
         folder: of the dataset.
         scatter: how the goal ranks episodes, if known.
+
+    Raises:
+        BadInput: the goal is pictures, and they are not in the folder.
     """
     ranking = (None, 0) if scatter is None else (scatter.spearman, len(scatter.x))
     if (folder / GOAL_FOLDER).is_dir():
@@ -48,9 +52,9 @@ def goal_panel(name: str, record: RelabelRecord, folder: Path, scatter: Scatter 
             tuple(read_image(path) for path in list_images(folder / GOAL_FOLDER / part)) for part in ("init", "goal")
         )
         return GoalPanel(name, start, goal, *ranking)
-    views = record.scorer.views
-    sentences = (
-        read_text(record.scorer.goal) if views is None else read_goal(record.scorer.goal, get_task(views["task"]))
-    )
+    views, spec = record.scorer.views, record.scorer.goal
+    if not (spec == TASK_TEXT or spec.startswith(TEXT)):  # a dataset names no other folders to read
+        raise BadInput(f"{folder} lacks the pictures of its goal, {GOAL_FOLDER}/; relabel it again")
+    sentences = read_text(spec) if views is None else read_goal(spec, get_task(views["task"]))
     kept = range(len(sentences.goals)) if record.kept_goals is None else record.kept_goals
     return GoalPanel(name, sentences.starts, tuple(sentences.goals[k] for k in kept), *ranking)

@@ -35,6 +35,15 @@ def check_file(path: Path) -> None:
         )
 
 
+def is_there(path: Path) -> bool:
+    """Whether something has this name; no error for names that nothing can have."""
+    try:
+        path.stat()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
 def path_under(root: Path, name: str) -> Path:
     """Return where a file is that data in a folder name, whether or not it exists.
 
@@ -49,7 +58,7 @@ def path_under(root: Path, name: str) -> Path:
         BadInput: the name is absolute or goes up.
     """
     if Path(name).is_absolute() or ".." in Path(name).parts:
-        raise BadInput(f"{root} names the file {name!r}, which is outside that folder; do not use this download")
+        raise BadInput(f"{root} names the file {name[:200]!r}, which is outside that folder; do not use this download")
     return root / name
 
 

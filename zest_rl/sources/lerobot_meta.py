@@ -14,7 +14,7 @@ from zest_rl.data.observations import choose_pictures
 from zest_rl.data.picture_forms import PictureForm
 from zest_rl.errors import BadInput, Notice, ZestError
 from zest_rl.runtime import artifacts
-from zest_rl.runtime.files import path_under
+from zest_rl.runtime.files import is_there, path_under
 from zest_rl.sources.parquet import read_table
 
 INFO = Path("meta", "info.json")
@@ -46,7 +46,7 @@ class ListedEpisode:
         if self.n_steps < 1:
             return f"has {self.n_steps} steps"
         files = (path_under(root, name) for name in (self.data, *(name for name, _ in self.videos)))
-        return next((f"lacks {path.relative_to(root).as_posix()}" for path in files if not path.exists()), "")
+        return next((f"lacks {path.relative_to(root).as_posix()[:200]}" for path in files if not is_there(path)), "")
 
 
 @dataclass(frozen=True)

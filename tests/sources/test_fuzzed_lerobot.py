@@ -1,0 +1,47 @@
+"""Damaged LeRobot folders: read or refused, never a crash, a hang or an error of Arrow."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+from pathlib import Path
+
+import pytest
+from fuzzing import damaged_bytes, damaged_json, faults, outcome
+from lerobot_files import write_lerobot
+from rollouts import Episode
+
+from zest_rl.sources import open_source
+
+FILES = {
+    "info": "meta/info.json",
+    "listing": "meta/episodes/chunk-000/file-000.parquet",
+    "data": "data/chunk-000/file-000.parquet",
+    "video": "videos/observation.images.top/chunk-000/file-000.mp4",
+}
+
+
+@pytest.mark.parametrize("n", [25, pytest.param(2000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("what", ["info as JSON", *FILES])
+def test_damaged_lerobot_folders_are_read_or_refused(what: str, n: int, maze: list[Episode], tmp_path: Path) -> None:
+    root, rng = write_lerobot(tmp_path / "pusht", maze), random.Random(what)
+    path = root / FILES[what.split()[0]]
+    whole = path.read_bytes()
+
+    def read(data: bytes) -> list[str]:
+        path.write_bytes(data)
+        source = open_source(str(root))
+        return [source.trajectories.fingerprint(), *(str(len(list(source.frames.read(i)))) for i in range(2))]
+
+    def damaged() -> bytes:
+        if what == "info as JSON":
+            return json.dumps(damaged_json(json.loads(whole), rng)).encode()
+        return damaged_bytes(whole, rng)
+
+    inputs = (damaged() for _ in range(n))
+    counts, wrong = faults(outcome(lambda data=data: read(data)) for data in inputs)
+    print(f"LeRobot {what}: {n} inputs, {dict(counts)}")
+    assert not wrong, wrong[0]
+    assert counts["refused"]
+    shutil.rmtree(root)
