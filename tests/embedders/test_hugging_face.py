@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tokenizers
 import torch
 import transformers
 from PIL import Image
@@ -81,7 +82,7 @@ def test_transformers_embeds_images_as_the_library_does(
 def test_a_folder_without_a_tokenizer_is_told_so(tmp_path: Path) -> None:
     save_hugging_face("clip", tmp_path)
     (tmp_path / "tokenizer_config.json").unlink()
-    with pytest.raises(BadInput, match=r"tokenizer_config\.json is not a file"):
+    with pytest.raises(BadInput, match=r"tokenizer_config\.json does not exist"):
         load_embedder(f"transformers:{tmp_path}").embed_texts(SENTENCES)
 
 
@@ -96,6 +97,20 @@ def test_transformers_embeds_sentences_as_the_library_does(kind: str, padding: b
     vectors = embedder.embed_texts(SENTENCES)
     np.testing.assert_allclose(vectors, expected, atol=1e-4)
     assert not np.allclose(vectors[0], vectors[1])
+
+
+def test_siglip_reads_sentences_in_lower_case_as_it_was_trained(tmp_path: Path) -> None:
+    """SigLIP 2 is published with Gemma's tokenizer, which keeps capitals."""
+    save_hugging_face("siglip", tmp_path)
+    words = ["<pad>", "<unk>", "Open", "DOOR", "open", "door"]
+    tokenizer = tokenizers.Tokenizer(tokenizers.models.WordLevel({w: i for i, w in enumerate(words)}, "<unk>"))
+    tokenizer.pre_tokenizer = tokenizers.pre_tokenizers.Whitespace()
+    transformers.PreTrainedTokenizerFast(
+        tokenizer_object=tokenizer, pad_token="<pad>", unk_token="<unk>", model_input_names=["input_ids"]
+    ).save_pretrained(tmp_path)
+    capitals, small, other = load_embedder(f"transformers:{tmp_path}").embed_texts(["Open DOOR", "open door", "door"])
+    np.testing.assert_array_equal(capitals, small)
+    assert not np.allclose(small, other)
 
 
 def test_a_vision_transformer_without_weights_for_its_pooling_gives_its_class_token(
@@ -124,5 +139,5 @@ def test_transformers_weights_that_are_not_all_there_are_refused(tmp_path: Path)
     with pytest.raises(BadInput, match="nowhere is not a folder"):
         load_embedder(f"transformers:{tmp_path}/nowhere")
     (tmp_path / "config.json").unlink()
-    with pytest.raises(BadInput, match=r"config\.json is not a file"):
+    with pytest.raises(BadInput, match=r"config\.json does not exist"):
         load_embedder(f"transformers:{tmp_path}")

@@ -135,7 +135,7 @@ def test_views_of_an_unknown_task_are_refused_with_the_nearest() -> None:
 
 
 def test_views_without_a_camera_or_a_pixel_are_refused() -> None:
-    with pytest.raises(BadInput, match="number of views must be at least 1, got 0"):
+    with pytest.raises(BadInput, match="number of views must be 1 to 1000, got 0"):
         Views("micro", n_views=0).fingerprint()
-    with pytest.raises(BadInput, match="size must be at least 1 pixel, got 0"):
+    with pytest.raises(BadInput, match="size must be 1 to 4096 pixels, got 0"):
         Views("micro", size=0).fingerprint()

@@ -376,7 +376,7 @@ def test_nothing_flows_from_the_ground_truth_into_rewards_or_policies(
         ),
         (["../tiny-v0"], "there is no file or folder ../tiny-v0; give .* or a Minari id"),
         ([SOURCE, "--embedder", "efficientnet-lite"], "unknown embedder.*did you mean 'efficientnet-lite0'"),
-        ([SOURCE, "--embedder", "timm:resnet10t@/none.pth"], "/none.pth is not a file"),
+        ([SOURCE, "--embedder", "timm:resnet10t@/none.pth"], "/none.pth does not exist"),
         ([SOURCE, "--goal", "drawing"], "unknown goal 'drawing': it is neither 'same-scene', 'drawings'"),
         (
             [SOURCE, "--goal", "text:closed -> open"],
@@ -386,7 +386,7 @@ def test_nothing_flows_from_the_ground_truth_into_rewards_or_policies(
         ([SOURCE, "--similarity", "cosine"], "cosine"),
         ([SOURCE, "--reward", "levels"], "levels"),
         ([SOURCE, "--precision", "fp16"], "fp16"),
-        ([SOURCE, "--views", "0"], "number of views must be at least 1, got 0"),
+        ([SOURCE, "--views", "0"], "number of views must be 1 to 1000, got 0"),
         ([SOURCE, "--views", "many"], "many"),
         ([SOURCE, "--tolerance", "-1"], "tolerance must be a finite number >= 0 .*got -1"),
         ([SOURCE, "--device", "gpu"], "unknown device 'gpu'.*valid: auto, cpu, cuda"),

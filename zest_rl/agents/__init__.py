@@ -17,6 +17,7 @@ from zest_rl.agents import bc, dt, foreign
 from zest_rl.agents.base import Agent, DataFacts, Policy
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime.artifacts import hash_bytes, read_json
+from zest_rl.runtime.trust import remember
 
 __all__ = ["AGENTS", "Agent", "Policy", "get_agent", "load_policy"]
 
@@ -37,15 +38,22 @@ def get_agent(name: str) -> Agent[Any]:
     return AGENTS[name]
 
 
-def load_policy(run_dir: Path, device: str = "cpu") -> Policy:
+def load_policy(run_dir: Path, device: str = "cpu", *, trust: bool = False) -> Policy:
     """Return the policy of a finished run; it acts in the precision it was trained in.
+
+    Args:
+        run_dir: the run's folder.
+        device: where the policy runs.
+        trust: run a foreign policy that was not adopted on this machine, now and from now on.
 
     Raises:
         ZestError: the run is not finished, or its weights differ from those that ``meta.json`` names.
-        BadInput: its agent is unknown here, or a foreign policy cannot be read.
+        BadInput: its agent is unknown here, or a foreign policy is not trusted or cannot be read.
     """
     meta: dict[str, Any] = read_json(run_dir / "meta.json")
     if meta["agent"] == foreign.FOREIGN:
+        if trust:
+            remember("policy", meta["policy"])
         return foreign.load(run_dir, meta, torch.device(device))
     agent = get_agent(meta["agent"])
     path = run_dir / "model.safetensors"

@@ -12,7 +12,7 @@ All of them map raw observations (N, obs_dim) float32, as in the dataset, to act
 callable or a TorchScript module has a method `begin(n_episodes)`, it is called when N new episodes start.
 
 Nothing is unpickled in this process; but TorchScript, ONNX, commands and packages run their authors' code, and d3rlpy
-unpickles its models in its own process.
+unpickles its models in its own process. So `load` wants each to be trusted (`zest_rl.runtime.trust`).
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from zest_rl.agents.base import check_obs
 from zest_rl.agents.child import PolicyProcess
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime.artifacts import hash_file
+from zest_rl.runtime.trust import check_trusted
 from zest_rl.types import FloatArray
 
 FOREIGN = "foreign"
@@ -76,6 +77,14 @@ class PolicyIdentity:
     def to_json(self) -> dict[str, Any]:
         """What the run's ``meta.json`` holds as ``policy``."""
         return {"family": self.family, "words": list(self.words), "files": dict(self.files), "code": self.code}
+
+    def what_runs(self) -> str:
+        """Say what acting with it runs."""
+        if self.family in ("command", "d3rlpy"):
+            return f"runs the program {shlex.join(self.words)}"
+        if self.family in FAMILIES:
+            return f"runs the code in {self.words[0]} ({self.family})"
+        return f"calls {self.code} with {self.words[0]!r}"
 
 
 def parse(spec: str, python: str | None = None) -> tuple[str, str]:
@@ -267,10 +276,13 @@ def load(run_dir: Path, meta: dict[str, Any], device: torch.device) -> ForeignPo
     """Return the policy of a run that `zest_rl.training.adoption.adopt` made.
 
     Raises:
-        BadInput: a file cannot be read, or its family is not known here.
+        BadInput: it is not trusted, a file cannot be read, or its family is not known here.
         ZestError: a file is missing or was changed, or the library that reads it is not installed.
     """
     identity = PolicyIdentity.from_json(meta["policy"])
+    check_trusted(
+        "policy", meta["policy"], f"{run_dir} holds the policy {meta['name']!r}, which {identity.what_runs()}"
+    )
     for name, sha256 in identity.files.items():
         path = run_dir / name
         if not path.is_file() or hash_file(path) != sha256:

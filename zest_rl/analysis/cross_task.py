@@ -15,7 +15,7 @@ from zest_rl.analysis.reward_figures import FIGURES
 from zest_rl.data.reader import dataset_path
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.metrics.statistics import bootstrap
-from zest_rl.rewards.scorer import SCORER_FILE
+from zest_rl.rewards.scorer import SCORER_FILE, check_scorer
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.types import FloatArray
 
@@ -146,6 +146,7 @@ def inspect_datasets(
     datasets: Sequence[str],
     *,
     n_workers: int | None = None,
+    trust: bool = False,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> JointInspection:
     """Inspect relabeled datasets and, where they are of several tasks, compare their goals across the tasks.
@@ -153,6 +154,7 @@ def inspect_datasets(
     Args:
         datasets: ids; duplicates are ignored.
         n_workers: processes that embed, default one per core.
+        trust: load the embedders that the datasets name, now and from now on (`zest_rl.runtime.trust`).
         on_progress: called with (parts done, parts in all).
 
     Raises:
@@ -170,6 +172,8 @@ def inspect_datasets(
     for dataset in ids:
         inspections.append(inspect(dataset))
         try:
+            if trust:
+                check_scorer(dataset_path(dataset) / SCORER_FILE, trust=True)
             views[dataset] = best_and_worst(inspections[-1], n_workers=n_workers)
         except ZestError as error:
             left_out.append(f"no episode of {dataset} is shown: {error}")

@@ -17,6 +17,7 @@ from zest_rl.errors import BadInput
 from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.metrics.reward_quality import returns_of
 from zest_rl.metrics.statistics import MIN_EPISODES_TO_RANK, Estimate
+from zest_rl.runtime.privacy import masked
 from zest_rl.types import FloatArray, GroundTruth
 
 
@@ -142,7 +143,7 @@ def _settings(inspection: Inspection) -> dict[str, Any]:
     """Return the settings in which rewards of one task and goal may differ, by their name in a label."""
     record, scorer = inspection.relabel, inspection.relabel.scorer
     return {
-        "embedder": scorer.embedder,
+        "embedder": masked(scorer.embedder),
         "features": scorer.features,
         "similarity": scorer.similarity,
         "views": record.n_views,

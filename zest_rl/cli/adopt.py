@@ -37,6 +37,7 @@ class Config:
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Hash, copy, try."""
     from zest_rl.runtime import artifacts
+    from zest_rl.runtime.privacy import masked
     from zest_rl.training.adoption import adopt
 
     run_dir = adopt(
@@ -52,6 +53,6 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     return {
         "run": str(run_dir),
         "name": meta["name"],
-        "files": meta["policy"]["files"],
+        "files": masked(meta["policy"]["files"]),
         "next": f"zest evaluate {shlex.quote(str(run_dir))}",
     }

@@ -38,6 +38,8 @@ class Config:
     """Where the policy runs; those with a process of their own decide for themselves."""
     n_workers: int | None = None
     """Processes; default one per core."""
+    trust: bool = False
+    """Run the policy and load the embedder that a run of somebody else names; remembered for these."""
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
@@ -47,9 +49,8 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
     started, asked = time.monotonic(), settings(config)
     with ui.progress("episodes", config.n_episodes) as advance:
-        result = evaluate(
-            config.run, asked, score=config.score, device=config.device, n_workers=config.n_workers, on_progress=advance
-        )
+        options = {name: getattr(config, name) for name in ("score", "device", "n_workers", "trust")}
+        result = evaluate(config.run, asked, **options, on_progress=advance)
     seconds, summary = round(time.monotonic() - started, 2), result.summary()
     if clipped := summary.get("clipped_actions"):
         ui.warn(f"{clipped:.1%} of the actions left [-1, 1] and were clipped, as the environment does")

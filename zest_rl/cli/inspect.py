@@ -24,6 +24,8 @@ class Config:
     """The HTML page."""
     n_workers: int | None = None
     """Processes that embed; default one per core."""
+    trust: bool = False
+    """Load the embedder that a dataset of somebody else names; remembered for this embedder."""
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
@@ -33,7 +35,9 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     from zest_rl.report.inspection_page import inspection_report
 
     with progress_in_parts(ui, "inspecting") as on_progress:
-        inspected = inspect_datasets(config.datasets, n_workers=config.n_workers, on_progress=on_progress)
+        inspected = inspect_datasets(
+            config.datasets, n_workers=config.n_workers, trust=config.trust, on_progress=on_progress
+        )
     for sentence in inspected.left_out:
         ui.warn(sentence)
     for dataset, sentences in inspected.warnings.items():

@@ -21,6 +21,8 @@ class Config:
     """The HTML file."""
     title: str = "ZeST rewards for offline robot learning"
     """Headline."""
+    trust: bool = False
+    """Load the embedder that a dataset of somebody else names; remembered for this embedder."""
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
@@ -29,7 +31,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     from zest_rl.report.html import write_report
     from zest_rl.report.sections import RESULTS
 
-    report = compare_runs(config.runs, title=config.title)
+    report = compare_runs(config.runs, title=config.title, trust=config.trust)
     path = write_report(report, config.output)
     return {
         "report": str(path),

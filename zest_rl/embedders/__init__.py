@@ -12,9 +12,9 @@
 | `NAME:REST` | a family that another package registers (entry point in the group `zest_rl.embedders`) |
 
 With `@/path` the name still chooses architecture, activation and preprocessing, so keep the TAG when the file holds a
-tag's weights. A checkpoint is a `.safetensors` file or one that `torch.load(weights_only=True)` reads, and it must fill
-every parameter except the classification head, which is cut off: no embedder ever runs on random weights. Images go
-through each model's own preprocessing.
+tag's weights. A checkpoint is a `.safetensors` file or what `torch.save` or TorchScript wrote, out of which tensors are
+read and nothing is run. It must fill every parameter except the classification head, which is cut off: no embedder ever
+runs on random weights. Images go through each model's own preprocessing.
 
 Torch is imported only when a network is needed: the default embedder knows its `fingerprint` and `dim` without it, so
 that work on cached embeddings starts at once.

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
+import re
 import urllib.error
 import urllib.request
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from zest_rl.errors import BadInput, ZestError
+from zest_rl.runtime.files import check_file
 
 if TYPE_CHECKING:
     import torch
@@ -24,6 +27,11 @@ LITE0_PREPROCESSING: dict[str, Any] = {
 }  # fmt: skip
 OPENAI_SIZES = ("input_resolution", "context_length", "vocab_size")
 """Entries besides the weights that only OpenAI's checkpoints of CLIP hold."""
+_WRAPPERS = (
+    "state_dict_ema", "model_ema", "state_dict", "model_state_dict", "model", "net", "teacher", "student",
+)  # fmt: skip
+"""Keys under which training scripts keep the weights, the preferred ones first."""
+_PREFIXES = ("model.", "net.", "backbone.")
 _HUB_TIMEOUT = 5.0  # seconds; the hub libraries' own retries take up to a minute
 
 
@@ -47,32 +55,43 @@ def reading(path: Path) -> Iterator[None]:
     """Turn any error that a library raises on a foreign file into one clear message.
 
     Raises:
-        BadInput: `path` is not a file, or the block failed on its content.
+        BadInput: `check_file` refuses `path`, or the block failed on its content.
     """
-    if not path.is_file():
-        raise BadInput(f"{path} is not a file; give the path of a checkpoint")
+    check_file(path)
     try:
         yield
     except ZestError:
         raise
     except Exception as error:
         reason = " ".join(str(error).split())[:300]
+        if "weights_only" in reason:  # torch goes on to explain how to let a file run code
+            reason = "it holds objects besides tensors and plain values"
         raise BadInput(
             f"{path} cannot be read as the weights of this model ({type(error).__name__}: {reason}); expected "
-            "a .safetensors file or a state dict that torch.load(weights_only=True) reads"
+            "a .safetensors file or a state dict that torch.save wrote"
         ) from error
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a state dict (name → tensor), unwrapped from training checkpoints and their ``module.`` prefixes.
+    """Read a state dict (name → tensor), out of what training scripts wrap around it.
+
+    Weights that were averaged over the training are preferred, as in timm.
 
     Raises:
         BadInput: `path` is no file or no checkpoint.
     """
-    from timm.models import load_state_dict
-
     with reading(path):
-        return dict(load_state_dict(str(path), weights_only=True))
+        state = _read(path)
+        for key in _WRAPPERS:
+            if isinstance(state, Mapping) and isinstance(state.get(key), Mapping):
+                state = state[key]
+                break
+        if not isinstance(state, Mapping):
+            raise BadInput(
+                f"{path} holds a whole object of {type(state).__name__.removeprefix('__torch__.')}, which only its own "
+                "code can read; where that is installed: torch.save(model.state_dict(), FILE)"
+            )
+        return {re.sub(r"^(_orig_mod\.|module\.)+", "", name): value for name, value in state.items()}
 
 
 def read_openai(path: Path) -> dict[str, Any] | None:
@@ -81,26 +100,28 @@ def read_openai(path: Path) -> dict[str, Any] | None:
     Raises:
         BadInput: `path` is no file or no checkpoint.
     """
-    import torch
-
     with reading(path):
         if path.suffix == ".safetensors":
             return None
-        if _is_torch_script(path):
-            archive: torch.nn.Module = torch.jit.load(str(path), map_location="cpu")  # type: ignore[no-untyped-call]
-            state = archive.state_dict()
-        else:
-            state = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
-    if not set(OPENAI_SIZES) <= set(state):
+        state = _read(path)
+    if not isinstance(state, Mapping) or not set(OPENAI_SIZES) <= set(state):
         return None
     return {name: value for name, value in state.items() if name not in OPENAI_SIZES}
 
 
-def _is_torch_script(path: Path) -> bool:
-    if not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        return any(name.endswith("/constants.pkl") for name in archive.namelist())
+def _read(path: Path) -> Any:
+    """Read a file of tensors; nothing in it is run."""
+    import safetensors.torch
+    import torch
+
+    from zest_rl.embedders.archives import read_archive
+
+    if path.suffix == ".safetensors":
+        return safetensors.torch.load_file(path)
+    if zipfile.is_zipfile(path):
+        return read_archive(path)
+    with torch.serialization.safe_globals([argparse.Namespace]):  # torch before 1.6
+        return torch.load(path, map_location="cpu", weights_only=True)
 
 
 def fill(
@@ -108,11 +129,17 @@ def fill(
 ) -> None:
     """Load `state` into `module`, except the keys under `heads`, the classification heads that are cut off.
 
+    Where no name fits, a prefix that wrappers give the model's names is taken off, and what has none is left out: the
+    loss of a Lightning module, the projection of DINO.
+
     Raises:
         BadInput: keys are missing, unexpected or of another shape.
     """
-    state = {name: value for name, value in state.items() if not name.startswith(heads)}
     needed = module.state_dict()
+    for prefix in _PREFIXES:
+        if not any(name in state for name in needed) and any(name.startswith(prefix) for name in state):
+            state = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+    state = {name: value for name, value in state.items() if not name.startswith((*heads, "n_averaged"))}
     missing = [name for name in needed if name not in state and not name.endswith("num_batches_tracked")]
     unexpected = [name for name in state if name not in needed]
     reshaped = [name for name in needed if name in state and getattr(state[name], "shape", None) != needed[name].shape]

@@ -51,7 +51,7 @@ def build(uri: str, source: str) -> Network:
         model, info = AutoModel.from_pretrained(
             name, output_loading_info=True, dtype=torch.float32, trust_remote_code=False
         )
-        return model, info, AutoImageProcessor.from_pretrained(name)  # type: ignore[no-untyped-call]
+        return model, info, AutoImageProcessor.from_pretrained(name, trust_remote_code=False)  # type: ignore[no-untyped-call]
 
     if folder.is_dir():
         with checkpoints.reading(folder / "config.json"):
@@ -84,10 +84,13 @@ def build(uri: str, source: str) -> Network:
         if tokenizer is None:
             if folder.is_dir():
                 with checkpoints.reading(folder / "tokenizer_config.json"):
-                    tokenizer = AutoTokenizer.from_pretrained(str(folder))
+                    tokenizer = AutoTokenizer.from_pretrained(str(folder), trust_remote_code=False)
             else:
-                tokenizer = checkpoints.fetch(uri, lambda: AutoTokenizer.from_pretrained(source))
-        siglip = module.config.model_type.startswith("siglip")  # which was trained on padded sentences
+                tokenizer = checkpoints.fetch(
+                    uri, lambda: AutoTokenizer.from_pretrained(source, trust_remote_code=False)
+                )
+        siglip = module.config.model_type.startswith("siglip")  # which was trained on padded sentences in lower case
+        sentences = [sentence.lower() for sentence in sentences] if siglip else sentences
         length = module.config.text_config.max_position_embeddings
         tokens = tokenizer(
             sentences, padding="max_length" if siglip else True, max_length=length, truncation=True, return_tensors="pt"

@@ -84,7 +84,7 @@ def build_lite0(weights: Path) -> Network:
     Raises:
         ZestError: the file has another layout.
     """
-    state = torch.load(weights, map_location="cpu", weights_only=True)
+    state = checkpoints.read_checkpoint(weights)
     module = timm.create_model("tf_efficientnet_lite0", pretrained=False)
     needed = module.state_dict()
     layout, expected = (

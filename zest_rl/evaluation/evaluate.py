@@ -21,7 +21,7 @@ from zest_rl.evaluation.rollout import Rtg, Traces, run_episodes, uses_online_sc
 from zest_rl.kitchen.env import ENV_ID
 from zest_rl.kitchen.videos import Video, ensure_videos
 from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return, representative, wilson
-from zest_rl.rewards.scorer import SCORER_FILE
+from zest_rl.rewards.scorer import SCORER_FILE, check_scorer
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.parallel import cached_jobs, chunks, one_thread, read_parts
@@ -142,6 +142,7 @@ def evaluate(
     videos: bool = False,
     device: str = "cpu",
     n_workers: int | None = None,
+    trust: bool = False,
     on_progress: Callable[[int], None] | None = None,
 ) -> Evaluation:
     """Evaluate the final policy of a run; finished parts are kept, so an interrupted evaluation goes on from there.
@@ -153,16 +154,19 @@ def evaluate(
         videos: also write `episode_videos`.
         device: where the policy runs.
         n_workers: number of processes, default one per core.
+        trust: run the policy of somebody else, and load the embedder that the run names, now and from now on
+            (`zest_rl.runtime.trust`).
         on_progress: called with the number of episodes finished since the last call.
 
     Raises:
-        BadInput: the run is unfinished, is not of the kitchen, or has no scorer although scores are needed.
+        BadInput: the run is unfinished, is not of the kitchen, is not trusted, or has no scorer although scores are
+            needed.
         ZestError: a part of the run is damaged.
     """
     config = EvaluationConfig() if config is None else config
     check_finished(run)
     run = run.resolve()
-    policy = load_policy(run, device=device)
+    policy = load_policy(run, device=device, trust=trust)
     dataset = DatasetRecord.of_run(policy.meta)
     if not is_evaluable(dataset):
         raise BadInput(
@@ -182,6 +186,8 @@ def evaluate(
             else "it was not trained on a relabeled dataset; use --rtg constant, or train on what `zest relabel` writes"
         )
         raise BadInput(f"scores are needed, but {run.name} has no {SCORER_FILE}: {reason}")
+    if scored:
+        check_scorer(run / SCORER_FILE, trust=trust)
     folder = evaluation_folder(run, config)
     jobs = {}
     for part in chunks(config.n_episodes, max(EPISODES_PER_JOB, config.n_episodes // N_JOBS)):

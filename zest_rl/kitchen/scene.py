@@ -31,6 +31,8 @@ N_QPOS = 30
 """Length of the kitchen's qpos."""
 N_ROBOT_QPOS = 9
 """The leading entries of qpos: 7 arm joints and 2 fingers; the rest belongs to objects."""
+MAX_SIZE = 4096
+"""Pixels of a side of the largest frame."""
 
 _RENDERER_VERSION = 1  # raise it when a pixel changes, here or in simulation/: cached embeddings depend on it
 _KITCHEN = Path("envs", "assets", "kitchen_franka")
@@ -51,8 +53,8 @@ class RenderConfig:
     """Share of the robot's visual faces that is kept, in (0, 1]; no effect while the robot is hidden."""
 
     def __post_init__(self) -> None:
-        if self.size < 1:
-            raise BadInput(f"size must be at least 1 pixel, got {self.size}; embedders usually want 224")
+        if not 1 <= self.size <= MAX_SIZE:
+            raise BadInput(f"size must be 1 to {MAX_SIZE} pixels, got {self.size}; embedders usually want 224")
         if not 0 < self.mesh_fraction <= 1:
             raise BadInput(f"mesh_fraction must be in (0, 1], got {self.mesh_fraction}; 1 keeps every face")
 

@@ -32,7 +32,7 @@ class Views:
     """Grid on which joint positions are rounded, in rad or m; 0: no rounding."""
 
     def __post_init__(self) -> None:
-        get_task(self.task)
+        _ = self.render_config, self.cameras  # each checks itself
         if not 0 <= self.tolerance < np.inf:
             raise BadInput(f"tolerance must be a finite number >= 0 (rad or m), got {self.tolerance}")
 

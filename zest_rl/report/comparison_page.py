@@ -33,7 +33,7 @@ from zest_rl.report.sections import (
     TASK_TABLES,
     Report,
 )
-from zest_rl.rewards.scorer import SCORER_FILE
+from zest_rl.rewards.scorer import SCORER_FILE, check_scorer
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.training.checkpoints import snapshots
 
@@ -131,12 +131,13 @@ def _curve(name: str, quantity: str, steps: Sequence[float], columns: Sequence[S
     return Curve(name, quantity, np.array(steps, dtype=np.float32), values.mean(axis=0), band)
 
 
-def compare_runs(runs: Sequence[Path], *, title: str) -> Report:
+def compare_runs(runs: Sequence[Path], *, title: str, trust: bool = False) -> Report:
     """Build the report of evaluated runs of one task, with the goals and the source that their datasets name.
 
     Args:
         runs: folders; those that differ in their seed alone become one row.
         title: of the page.
+        trust: load the embedder that the runs' datasets name, now and from now on (`zest_rl.runtime.trust`).
 
     Raises:
         BadInput: no run is given, or as in `methods_of_runs` and `compare`.
@@ -154,6 +155,8 @@ def compare_runs(runs: Sequence[Path], *, title: str) -> Report:
             if goals.setdefault(goal, dataset.id) != dataset.id:
                 goals[f"{goal} ({dataset.id})"] = dataset.id
     source = sources.pop() if len(sources) == 1 else None
+    for dataset_id in goals.values() if trust else ():
+        check_scorer(dataset_path(dataset_id) / SCORER_FILE, trust=True)
     return compare(title, methods, source_id=source if source is not None and exists(source) else None, goals=goals)
 
 

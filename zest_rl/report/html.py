@@ -25,6 +25,7 @@ from zest_rl.report import charts
 from zest_rl.report.charts import MISSING, number
 from zest_rl.report.sections import Report
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.privacy import masked
 from zest_rl.types import Frame
 
 THUMBNAIL = 160
@@ -119,7 +120,7 @@ def _sha256(text: str) -> str:
 
 
 def _json(value: object) -> str:
-    return json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False)
+    return json.dumps(masked(_plain(value)), indent=2, ensure_ascii=False, allow_nan=False)
 
 
 def _plain(value: object) -> object:

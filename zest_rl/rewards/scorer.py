@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.data.provenance import ScorerRecord
-from zest_rl.embedders import Embedder, Precision
+from zest_rl.embedders import DEFAULT_EMBEDDER, Embedder, Precision
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen.views import Views
 from zest_rl.rewards.embeddings import EmbeddedEpisode, check_equal, shared_embedder
@@ -34,7 +34,10 @@ from zest_rl.rewards.scores import (
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_arrays, write_arrays
 from zest_rl.runtime.cache import cache_folder
+from zest_rl.runtime.files import check_file
 from zest_rl.runtime.parallel import one_thread
+from zest_rl.runtime.records import from_json, reading_record
+from zest_rl.runtime.trust import check_trusted, remember
 from zest_rl.types import FloatArray
 
 SCORER_FILE = "zest_scorer.safetensors"
@@ -84,6 +87,7 @@ class Scorer:
             BadInput: the goal is a sentence and the embedder reads pictures only.
         """
         embedder = shared_embedder(config.embedder, config.precision, device)
+        remember("embedder", config.embedder)
         starts, goals = embed_goal_cached(goal, embedder)
         return cls(config, starts, goals, goal.fingerprint(), embedder.fingerprint, views, goal)
 
@@ -189,22 +193,14 @@ class Scorer:
         """Read what `save` wrote.
 
         Raises:
+            BadInput: the file names an embedder that this user did not, and did not trust (`trust_scorer`).
             ZestError: the file is missing or damaged, or the embedder or renderer here differs from the one that was
                 used (scores would not be comparable).
         """
-        from safetensors import SafetensorError, safe_open
-
-        try:
-            with safe_open(path, framework="numpy") as file:
-                described = json.loads(file.metadata()["scorer"])
-                starts, goals = file.get_tensor("starts"), file.get_tensor("goals")
-            values = dict(described["config"])
-            views = Views(**values.pop("views")) if "views" in values else None
-            config, goal_sha256 = ScorerConfig(**values), described["goal_sha256"]
-        except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
-            raise ZestError(f"the scorer {path} cannot be read ({error}); relabel the dataset again") from error
+        config, views, described, starts, goals = _read(path)
+        _check_embedder(path, config)
         embedder = shared_embedder(config.embedder, config.precision, device)
-        scorer = cls(config, starts, goals, goal_sha256, embedder.fingerprint, views)
+        scorer = cls(config, starts, goals, str(described["goal_sha256"]), embedder.fingerprint, views)
         record = scorer.record
         changed = [key for key in ("embedder_sha256", "views_sha256") if getattr(record, key) != described.get(key)]
         if changed:
@@ -213,6 +209,58 @@ class Scorer:
                 "(weights, precision, or versions differ); relabel and train here, or use the versions of its meta.json"
             )
         return scorer
+
+
+def check_scorer(path: Path, *, trust: bool = False) -> None:
+    """Check that a scorer's file may be loaded, without loading its embedder.
+
+    Args:
+        path: of the file.
+        trust: let it load the embedder that it names, from now on.
+
+    Raises:
+        BadInput: it names an embedder that this user did not.
+        ZestError: the file is missing or damaged.
+    """
+    config = _read(path)[0]
+    if trust:
+        remember("embedder", config.embedder)
+    _check_embedder(path, config)
+
+
+def _check_embedder(path: Path, config: ScorerConfig) -> None:
+    """Refuse an embedder that data name: a family may run a package, read a file, or download weights."""
+    if config.embedder != DEFAULT_EMBEDDER:
+        check_trusted("embedder", config.embedder, f"{path} would load the embedder {config.embedder}")
+
+
+def _read(path: Path) -> tuple[ScorerConfig, Views | None, dict[str, Any], FloatArray, FloatArray]:
+    """Read a scorer's file: config, views, all of its description, starts and goals."""
+    from safetensors import safe_open
+
+    if not path.exists():
+        raise ZestError(f"there is no scorer {path}; relabel the dataset again")
+    check_file(path)
+    with reading_record(path, "relabel the dataset again"):
+        with safe_open(path, framework="numpy") as file:
+            described: dict[str, Any] = json.loads(file.metadata()["scorer"])
+            starts, goals = file.get_tensor("starts"), file.get_tensor("goals")
+        values = dict(described["config"])
+        views = from_json(Views, values.pop("views")) if "views" in values else None
+        config = from_json(ScorerConfig, values)
+        for array in (starts, goals):
+            if (
+                array.dtype != np.float32
+                or array.ndim not in (2, 3)
+                or 0 in array.shape
+                or not np.isfinite(array).all()
+            ):
+                raise ValueError(f"{array.dtype} embeddings of shape {array.shape}, or not finite")
+        n_views = starts.shape[:-2] if views is None else (len(views.cameras),)[: starts.ndim - 2]
+        if not (starts.shape[:-2] == goals.shape[:-2] == n_views and starts.shape[-1] == goals.shape[-1]):
+            raise ValueError(f"starts of shape {starts.shape} beside goals of shape {goals.shape}")
+        described["goal_sha256"]
+    return config, views, described, starts, goals
 
 
 def embed_goal_cached(goal: GoalSpec, embedder: Embedder) -> tuple[FloatArray, FloatArray]:

@@ -30,6 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.errors import Notice, ZestError
+from zest_rl.runtime.files import check_file
+from zest_rl.runtime.privacy import masked
 
 PACKAGES = (
     "torch", "torchvision", "timm", "open_clip_torch", "transformers", "gymnasium", "gymnasium-robotics", "mujoco",
@@ -198,10 +200,11 @@ def read_json(path: Path) -> Any:
     Raises:
         ZestError: the file does not exist or is not JSON.
     """
+    if not path.exists():
+        raise ZestError(f"{path} does not exist; was the stage before this one run to its end?")
+    check_file(path)
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ZestError(f"{path} does not exist; was the stage before this one run to its end?") from error
     except (OSError, ValueError, RecursionError) as error:
         raise ZestError(f"{path} cannot be read as JSON: {error}") from error
 
@@ -301,13 +304,9 @@ def versions() -> dict[str, str]:
 
 
 def provenance() -> dict[str, Any]:
-    """Return command, versions, git revision and machine, JSON-ready, without host paths.
-
-    The folders of absolute paths in the command are left out: ``--goal=/home/me/goals`` becomes ``--goal=…/goals``.
-    """
-    arguments = [re.sub(r"(?<![^=:@,])/(?!/)(?:[^,]*/)?", "…/", word) for word in sys.argv[1:]]
+    """Return command, versions, git revision and machine, JSON-ready, without folders and secrets (`masked`)."""
     return {
-        "command": " ".join([Path(sys.argv[0]).name, *arguments]),
+        "command": " ".join([Path(sys.argv[0]).name, *masked(sys.argv[1:])]),
         "versions": versions(),
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",

@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 from zest_rl.errors import BadInput
 from zest_rl.simulation.rendering import Camera
 
+MAX_VIEWS = 1000
+"""Cameras of a ring: three to a degree, and a hundred times more than were of any use."""
+
 
 def ring(
     lookat: tuple[float, float, float],
@@ -33,10 +36,10 @@ def ring(
         elevations: in degrees, negative looks down; the cameras cycle through them.
 
     Raises:
-        BadInput: `n_views` is below 1.
+        BadInput: `n_views` is not in 1 … `MAX_VIEWS`.
     """
-    if n_views < 1:
-        raise BadInput(f"the number of views must be at least 1, got {n_views}")
+    if not 1 <= n_views <= MAX_VIEWS:
+        raise BadInput(f"the number of views must be 1 to {MAX_VIEWS}, got {n_views}")
     spread = np.linspace(*azimuths, n_views) if n_views > 1 else [sum(azimuths) / 2]
     return tuple(
         Camera(lookat, distances[i % len(distances)], float(azimuth), elevations[i % len(elevations)])

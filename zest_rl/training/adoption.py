@@ -23,6 +23,8 @@ from zest_rl.agents.base import describe_data
 from zest_rl.data.reader import open_dataset
 from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.privacy import masked
+from zest_rl.runtime.trust import remember
 from zest_rl.training.runs import default_run_dir, scorer_files
 from zest_rl.types import Episode
 
@@ -61,7 +63,8 @@ def adopt(
     """
     identity = foreign.identify(policy, python)
     if name is None:
-        name = f"{Path(identity.words[-1]).stem or identity.words[-1]} ({identity.family})"
+        last = masked(identity.words)[-1]
+        name = f"{Path(last).stem or last} ({identity.family})"
     if not name.strip() or seed < 0:
         raise BadInput(f"a policy needs a name and a seed of at least 0, got {name!r} and {seed}")
     with open_dataset(dataset_id) as dataset:
@@ -85,6 +88,7 @@ def adopt(
         "data_sha256": artifacts.hash_arrays(*(a for e in episodes for a in (e.obs, e.actions, e.rewards))),
         "dataset": description,
     }
+    remember("policy", request["policy"])
     with artifacts.lock(run_dir):
         if (run_dir / "meta.json").exists():
             before = artifacts.read_json(run_dir / "meta.json")

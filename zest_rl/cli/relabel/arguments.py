@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 import tyro
 
-from zest_rl.errors import BadInput
 from zest_rl.rewards.scores import Features, Similarity, check_goal_share, check_names
 
 
@@ -60,5 +59,3 @@ class Config:
     def __post_init__(self) -> None:
         check_names(self.features, self.similarity)
         check_goal_share(self.goal_share)
-        if self.views < 1:
-            raise BadInput(f"the number of views must be at least 1, got {self.views}")
