@@ -212,5 +212,5 @@ def test_a_policy_says_what_it_cannot_do(run: Path) -> None:
 
 
 def test_all_problems_of_a_config_are_named_at_once() -> None:
-    with pytest.raises(BadInput, match=r"context_len must be at least 1, got 0; n_heads must be a divisor"):
+    with pytest.raises(BadInput, match=r"context_len must be 1 to 2048, got 0; n_heads must be a divisor"):
         dt.DTConfig(context_len=0, n_heads=3)

@@ -17,6 +17,7 @@ from zest_rl.agents import bc, dt, foreign
 from zest_rl.agents.base import Agent, DataFacts, Policy
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime.artifacts import hash_bytes, read_json
+from zest_rl.runtime.records import from_json, reading_record
 from zest_rl.runtime.trust import remember
 
 __all__ = ["AGENTS", "Agent", "Policy", "get_agent", "load_policy"]
@@ -48,13 +49,20 @@ def load_policy(run_dir: Path, device: str = "cpu", *, trust: bool = False) -> P
 
     Raises:
         ZestError: the run is not finished, or its weights differ from those that ``meta.json`` names.
-        BadInput: its agent is unknown here, or a foreign policy is not trusted or cannot be read.
+        BadInput: ``meta.json`` is not as this package writes it, its agent is unknown here, or a foreign policy is not
+            trusted or cannot be read.
     """
-    meta: dict[str, Any] = read_json(run_dir / "meta.json")
+    path = run_dir / "meta.json"
+    meta: dict[str, Any] = read_json(path)
+    with reading_record(path):
+        return _load(run_dir, meta, torch.device(device), trust=trust)
+
+
+def _load(run_dir: Path, meta: dict[str, Any], device: torch.device, *, trust: bool) -> Policy:
     if meta["agent"] == foreign.FOREIGN:
         if trust:
             remember("policy", meta["policy"])
-        return foreign.load(run_dir, meta, torch.device(device))
+        return foreign.load(run_dir, meta, device)
     agent = get_agent(meta["agent"])
     path = run_dir / "model.safetensors"
     try:
@@ -66,10 +74,14 @@ def load_policy(run_dir: Path, device: str = "cpu", *, trust: bool = False) -> P
             f"{path} is damaged: its sha256 is {hash_bytes(weights)}, meta.json says {meta['model_sha256']}; "
             "restore it from a copy or train again into a new folder"
         )
-    config = agent.config(**meta["config"])
-    facts = DataFacts(**{field.name: meta[field.name] for field in fields(DataFacts)})
+    config = from_json(agent.config, meta["config"])
+    facts = from_json(DataFacts, {field.name: meta[field.name] for field in fields(DataFacts)})
+    tensors = safetensors.torch.load(weights)
     with torch.random.fork_rng(devices=[]):  # the random initial weights are replaced below
+        with torch.device("meta"):  # makes no room yet
+            shapes = {name: tensor.shape for name, tensor in agent.build(config, facts).state_dict().items()}
+        if shapes != {name: tensor.shape for name, tensor in tensors.items()}:
+            raise ValueError(f"its config is not that of {path.name}")
         model = agent.build(config, facts)
-    model.load_state_dict(safetensors.torch.load(weights))
-    target = torch.device(device)
-    return agent.policy(model.to(target).eval(), config, facts, meta, target)
+    model.load_state_dict(tensors)
+    return agent.policy(model.to(device).eval(), config, facts, meta, device)

@@ -45,6 +45,19 @@ class DataFacts:
     rtg_schedule: tuple[float, ...]
     """(T+1,) return-to-go of the episode with the largest return; starts at that return and ends at 0."""
 
+    def __post_init__(self) -> None:
+        check_fields("facts about the data", self, {
+            "obs_dim": whole(self.obs_dim, LARGEST_WIDTH**2),
+            "act_dim": whole(self.act_dim, LARGEST_WIDTH**2),
+            "max_steps": whole(self.max_steps, 10**9),
+            "obs_mean": (len(self.obs_mean) == self.obs_dim, f"{self.obs_dim} numbers"),
+            "obs_std": (
+                len(self.obs_std) == self.obs_dim and min(self.obs_std) > 0, f"{self.obs_dim} positive numbers"
+            ),
+            "return_quantiles": (len(self.return_quantiles) == 101, "101 numbers"),
+            "rtg_schedule": (len(self.rtg_schedule) >= 1, "at least one number"),
+        })  # fmt: skip
+
     def normalize(self, obs: FloatArray) -> FloatArray:
         """Return ``(obs - mean) / std`` clipped to ± `MAX_NORMALIZED`; obs and result (…, obs_dim) float32."""
         mean, std = np.array(self.obs_mean, dtype=np.float32), np.array(self.obs_std, dtype=np.float32)
@@ -112,7 +125,25 @@ def autocast(precision: Precision, device: torch.device) -> torch.autocast:
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")
 
 
-Rules = Mapping[str, tuple[bool, str]]  # field: (holds, "must be …")
+Rule = tuple[bool, str]  # (holds, "must be …")
+Rules = Mapping[str, Rule]  # by field
+
+LARGEST_WIDTH, MOST_LAYERS, MOST_WEIGHTS = 2**14, 1000, 10**9
+LARGEST_BATCH = 2**20
+"""Bounds that no machine of today would train beyond; room is made only below them."""
+
+
+def whole(value: int, largest: int) -> Rule:
+    """Return the rule of a number that is counted from 1."""
+    return 1 <= value <= largest, f"1 to {largest}"
+
+
+def few_weights(n_layers: int, weights_per_layer: int) -> Rule:
+    """Return the rule of a number of equal layers."""
+    return (
+        1 <= n_layers <= MOST_LAYERS and n_layers * weights_per_layer <= MOST_WEIGHTS,
+        f"1 to {MOST_LAYERS}, and give at most {MOST_WEIGHTS:.0e} weights",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

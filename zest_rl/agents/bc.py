@@ -25,6 +25,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from zest_rl.agents.base import (
+    LARGEST_BATCH,
+    LARGEST_WIDTH,
     Agent,
     Batch,
     DataFacts,
@@ -34,6 +36,8 @@ from zest_rl.agents.base import (
     autocast,
     check_fields,
     check_obs,
+    few_weights,
+    whole,
 )
 from zest_rl.types import Episode, FloatArray
 
@@ -58,10 +62,10 @@ class BCConfig(OptimizerConfig):
     def __post_init__(self) -> None:
         check_fields("BC config", self, {
             "top_fraction": (0 < self.top_fraction <= 1, "in (0, 1]"),
-            "hidden_size": (self.hidden_size >= 1, "at least 1"),
-            "n_layers": (self.n_layers >= 1, "at least 1"),
+            "hidden_size": whole(self.hidden_size, LARGEST_WIDTH),
+            "n_layers": few_weights(self.n_layers, self.hidden_size**2),
             "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
-            "batch_size": (self.batch_size >= 1, "at least 1"),
+            "batch_size": whole(self.batch_size, LARGEST_BATCH),
             **self.optimizer_rules(),
         })  # fmt: skip
 

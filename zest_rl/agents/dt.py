@@ -28,6 +28,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from zest_rl.agents.base import (
+    LARGEST_BATCH,
+    LARGEST_WIDTH,
     Agent,
     Batch,
     DataFacts,
@@ -37,7 +39,9 @@ from zest_rl.agents.base import (
     autocast,
     check_fields,
     check_obs,
+    few_weights,
     returns_to_go,
+    whole,
 )
 from zest_rl.errors import BadInput
 from zest_rl.types import Episode, FloatArray
@@ -71,16 +75,16 @@ class DTConfig(OptimizerConfig):
 
     def __post_init__(self) -> None:
         check_fields("DT config", self, {
-            "context_len": (self.context_len >= 1, "at least 1"),
-            "hidden_size": (self.hidden_size >= 1, "at least 1"),
-            "n_layers": (self.n_layers >= 1, "at least 1"),
+            "context_len": whole(self.context_len, 2048),
+            "hidden_size": whole(self.hidden_size, LARGEST_WIDTH),
+            "n_layers": few_weights(self.n_layers, 12 * self.hidden_size**2),
             "n_heads": (
                 self.n_heads >= 1 and self.hidden_size % self.n_heads == 0,
                 f"a divisor of hidden_size ({self.hidden_size})",
             ),
             "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
             "timesteps": (self.timesteps in get_args(Timesteps), f"one of {', '.join(get_args(Timesteps))}"),
-            "batch_size": (self.batch_size >= 1, "at least 1"),
+            "batch_size": whole(self.batch_size, max(1, LARGEST_BATCH // max(1, self.context_len))),
             **self.optimizer_rules(),
         })  # fmt: skip
 

@@ -36,6 +36,7 @@ from zest_rl.agents.base import check_obs
 from zest_rl.agents.child import PolicyProcess
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime.artifacts import hash_file
+from zest_rl.runtime.records import from_json
 from zest_rl.runtime.trust import check_trusted
 from zest_rl.types import FloatArray
 
@@ -71,8 +72,12 @@ class PolicyIdentity:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
-        """Read what `to_json` returned."""
-        return cls(**{**values, "words": tuple(values["words"])})
+        """Read what `to_json` returned; raises as `zest_rl.runtime.records.from_json`."""
+        identity = from_json(cls, {**values, "words": tuple(values["words"])})
+        texts = (*identity.words, *identity.files, *identity.files.values())
+        if not identity.words or not all(isinstance(text, str) for text in texts):
+            raise TypeError("the words and files of a policy must be strings")
+        return identity
 
     def to_json(self) -> dict[str, Any]:
         """What the run's ``meta.json`` holds as ``policy``."""

@@ -6,6 +6,7 @@ All policies get the same starts (paired seeds). Episodes run in parts, one part
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,6 +26,7 @@ from zest_rl.rewards.scorer import SCORER_FILE, check_scorer
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.parallel import cached_jobs, chunks, one_thread, read_parts
+from zest_rl.runtime.records import from_json, reading_record
 from zest_rl.types import EpisodeResult
 
 EPISODES_PER_JOB, N_JOBS = 5, 10
@@ -249,16 +251,20 @@ def read_evaluation(folder: Path) -> Evaluation:
     Raises:
         ZestError: there is no result, or a part is damaged; evaluate again.
     """
-    result = artifacts.read_json(folder / "result.json")
-    config = EvaluationConfig(**result["config"])
+    path = folder / "result.json"
+    result = artifacts.read_json(path)
+    with reading_record(path):
+        config = from_json(EvaluationConfig, result["config"])
+        episodes = tuple(from_json(EpisodeResult, episode) for episode in result["episodes"])
+        target, references = result["summary"]["target_return"], result["references"]
+        minimum, expert = float(references["minimum"]), float(references["expert"])
+        if len(episodes) != config.n_episodes or not -math.inf < minimum < expert < math.inf:
+            raise ValueError(f"{len(episodes)} episodes, returns of {minimum} to {expert}")
+        traces = read_parts(folder / "parts", [Path(name).name for name in result["parts"]])
+        if len(traces["gt_reward"]) != config.n_episodes:
+            raise ValueError(f"its parts hold {len(traces['gt_reward'])} episodes")
     return Evaluation(
-        folder.parent.parent,
-        config,
-        result["summary"]["target_return"],
-        result["references"]["minimum"],
-        result["references"]["expert"],
-        tuple(EpisodeResult(**episode) for episode in result["episodes"]),
-        read_parts(folder / "parts", result["parts"]),
+        folder.parent.parent, config, None if target is None else float(target), minimum, expert, episodes, traces
     )
 
 

@@ -25,6 +25,9 @@ Rtg = Literal["online", "constant", "schedule"]
 """How the return-to-go falls: by the online ZeST score, not at all, or as in the best training episode."""
 Traces = dict[str, NDArray[Any]]
 
+MAX_HORIZON = 10_000
+"""Steps of an episode."""
+
 
 def uses_online_scores(policy: Policy, rtg: Rtg) -> bool:
     """Whether each new state must be scored while the policy acts."""
@@ -101,10 +104,11 @@ def _kitchen_spec(env_spec: str) -> gymnasium.envs.registration.EnvSpec:
     """Read the EnvSpec of a run, which may come from somebody else and must not choose what code is run."""
     check_env_spec(env_spec, "the environment of the run", "evaluate a run on a dataset of the kitchen")
     spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
-    if spec.id != ENV_ID or spec.max_episode_steps is None:
+    horizon = spec.max_episode_steps
+    if spec.id != ENV_ID or type(horizon) is not int or not 1 <= horizon <= MAX_HORIZON:
         raise BadInput(
-            f"evaluation needs {ENV_ID} with a horizon, got {spec.id} with max_episode_steps {spec.max_episode_steps}; "
-            "train on a dataset of `zest collect`"
+            f"evaluation needs {ENV_ID} with a horizon of 1 to {MAX_HORIZON} steps, got {spec.id} with "
+            f"max_episode_steps {horizon}; train on a dataset of `zest collect`"
         )
     check_registered(spec)
     return spec

@@ -187,7 +187,7 @@ def compare(
         BadInput: a run was not evaluated, or is of another task than the others.
     """
     metas = {str(run): read_meta(run) for method in methods for run in method.runs}
-    tasks = {DatasetRecord.of_run(meta).env["kwargs"]["task"] for meta in metas.values()}
+    tasks = {str(DatasetRecord.of_run(meta).task) for meta in metas.values()}
     if len(tasks) != 1:
         raise BadInput(f"a report compares runs of one task, got {', '.join(sorted(tasks))}; write one report per task")
     evaluations = {method.name: method.evaluations() for method in methods}

@@ -14,6 +14,7 @@ from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import Evaluation, EvaluationConfig, check_finished, evaluation_folder, read_evaluation
 from zest_rl.report.content import Kind
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.records import reading_record
 
 
 @dataclass(frozen=True)
@@ -54,11 +55,12 @@ def methods_of_runs(runs: Sequence[Path]) -> tuple[Method, ...]:
     described: dict[str, tuple[str, dict[str, Any]]] = {}
     for run in runs:
         meta = read_meta(run)
-        dataset = f"{meta['dataset']['id']} ({meta['data_sha256'][:8]})"
-        name, settings = _short_name(meta), {**meta["config"], "n_updates": meta["n_updates"], "dataset": dataset}
-        key = artifacts.hash_json([name, settings])
-        described[key] = name, settings
-        earlier = groups.setdefault(key, {}).setdefault(meta["seed"], run)
+        with reading_record(run / "meta.json"):
+            dataset = f"{meta['dataset']['id']} ({meta['data_sha256'][:8]})"
+            name, settings = _short_name(meta), {**meta["config"], "n_updates": meta["n_updates"], "dataset": dataset}
+            key = artifacts.hash_json([name, settings])
+            described[key] = name, settings
+            earlier = groups.setdefault(key, {}).setdefault(meta["seed"], run)
         if earlier != run:
             raise BadInput(
                 f"{earlier} and {run} are the same training with the same seed; give one of them"
@@ -72,10 +74,15 @@ def read_meta(run: Path) -> dict[str, Any]:
     """Read the ``meta.json`` of a finished run.
 
     Raises:
-        BadInput: the folder is not a finished run.
+        BadInput: the folder is not a finished run on a dataset of the kitchen.
     """
     check_finished(run)
     meta: dict[str, Any] = artifacts.read_json(run / "meta.json")
+    with reading_record(run / "meta.json"):
+        agent, dataset = str(meta["agent"]), DatasetRecord.of_run(meta)
+        of_kitchen = dataset.task is not None
+    if not of_kitchen:
+        raise BadInput(f"{run} ({agent}) was trained on {dataset.id}; `zest report` compares runs of the kitchen alone")
     return meta
 
 

@@ -1,0 +1,118 @@
+"""Run folders of somebody else: read or refused, whatever their files hold."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+
+import pytest
+from fuzzing import damaged_bytes, damaged_json, faults, outcome, outcomes
+
+from zest_rl.agents import load_policy
+from zest_rl.evaluation.evaluate import EvaluationConfig, evaluate, read_evaluation
+from zest_rl.report.methods import methods_of_runs
+from zest_rl.rewards.scorer import SCORER_FILE, check_scorer
+from zest_rl.runtime import artifacts
+from zest_rl.runtime.artifacts import hash_json
+
+COUNTS = [60, pytest.param(1500, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("n", COUNTS)
+@pytest.mark.parametrize("run", ["bc-0", "dt-0", "adopted"])
+def test_a_damaged_description_of_a_run_is_read_or_refused(run: str, n: int, trained: Path) -> None:
+    folder, rng = trained / run, random.Random(0)
+    if run == "adopted":
+        meta = artifacts.read_json(trained / "bc-0" / "meta.json")
+        policy = {"family": "command", "words": ["sh", "-c", "x"], "files": {"policy/p": "0" * 64}, "code": ""}
+        (folder / "policy").mkdir(parents=True)
+        artifacts.write_json(folder / "meta.json", meta | {"agent": "foreign", "name": "p", "policy": policy})
+    whole = artifacts.read_json(folder / "meta.json")
+    damaged = [json.dumps(damaged_json(whole, rng)).encode() for _ in range(n)]
+    damaged += [damaged_bytes(json.dumps(whole).encode(), rng) for _ in range(n)]
+
+    def read(i: int) -> str:
+        (folder / "meta.json").write_bytes(damaged[i])
+        methods_of_runs([folder])
+        return load_policy(folder).agent
+
+    counts, bad = faults(outcomes(read, len(damaged)))
+    print(run, "meta.json", len(damaged), dict(counts))
+    assert not bad, bad[0].detail
+
+
+@pytest.mark.parametrize("n", COUNTS)
+def test_damaged_weights_of_a_run_are_refused_even_under_their_own_hash(n: int, trained: Path) -> None:
+    folder, rng = trained / "bc-0", random.Random(0)
+    whole, meta = (folder / "model.safetensors").read_bytes(), artifacts.read_json(folder / "meta.json")
+    damaged = [damaged_bytes(whole[:4096], rng) + whole[4096:] for _ in range(n)]
+
+    def read(i: int) -> str:
+        (folder / "model.safetensors").write_bytes(damaged[i])
+        artifacts.write_json(folder / "meta.json", meta | {"model_sha256": artifacts.hash_bytes(damaged[i])})
+        return load_policy(folder).agent
+
+    counts, bad = faults(outcomes(read, n))
+    print("model.safetensors", n, dict(counts))
+    assert not bad, bad[0].detail
+
+
+@pytest.mark.parametrize("n", COUNTS)
+def test_a_damaged_scorer_is_read_or_refused(n: int, trained: Path) -> None:
+    path, rng = trained / "dt-0" / SCORER_FILE, random.Random(0)
+    from safetensors import safe_open
+    from safetensors.numpy import load_file, save
+
+    with safe_open(path, "numpy") as file:
+        described = json.loads(file.metadata()["scorer"])
+    whole, arrays = path.read_bytes(), load_file(path)
+    damaged = [damaged_bytes(whole[:2048], rng) + whole[2048:] for _ in range(n)]
+    damaged += [save(arrays, {"scorer": json.dumps(damaged_json(described, rng))}) for _ in range(n)]
+
+    def read(i: int) -> None:
+        path.write_bytes(damaged[i])
+        check_scorer(path)
+
+    counts, bad = faults(outcomes(read, len(damaged)))
+    print("scorer", len(damaged), dict(counts))
+    assert not bad, bad[0].detail
+
+
+@pytest.mark.parametrize("n", COUNTS)
+def test_a_damaged_result_of_an_evaluation_is_read_or_refused(n: int, trained: Path) -> None:
+    folder = evaluate(trained / "bc-0", EvaluationConfig(n_episodes=2, seed=3), n_workers=1).folder
+    whole, rng = artifacts.read_json(folder / "result.json"), random.Random(0)
+    damaged = [whole, *(damaged_json(whole, rng) for _ in range(n))]
+
+    def read(i: int) -> str:
+        (folder / "result.json").write_text(json.dumps(damaged[i]))
+        return hash_json(read_evaluation(folder).summary())
+
+    first, *others = outcomes(read, n + 1)
+    assert first.kind == "read", first.detail
+    counts, bad = faults(others)
+    print("result.json", n, dict(counts))
+    assert not bad, bad[0].detail
+
+
+@pytest.mark.parametrize(
+    ("run", "changes"),
+    [
+        ("bc-0", {"hidden_size": 10**9}),
+        ("bc-0", {"n_layers": 10**9}),
+        ("dt-0", {"context_len": 10**9}),
+        ("dt-0", {"n_layers": 500, "hidden_size": 2**14}),
+        ("bc-0", {"hidden_size": 16000}),
+    ],
+)
+def test_a_run_that_asks_for_absurd_room_is_refused_before_it_is_made(
+    run: str, changes: dict[str, int], trained: Path
+) -> None:
+    path = trained / run / "meta.json"
+    meta = artifacts.read_json(path)
+    artifacts.write_json(path, meta | {"config": meta["config"] | changes})
+    found = outcome(lambda: load_policy(trained / run))
+    assert found.kind == "refused", found.detail
+    artifacts.write_json(path, meta | {"max_steps": 10**9})
+    assert outcome(lambda: load_policy(trained / run)).kind == ("read" if run == "bc-0" else "refused")
