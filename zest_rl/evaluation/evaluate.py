@@ -257,15 +257,14 @@ def read_evaluation(folder: Path) -> Evaluation:
         config = from_json(EvaluationConfig, result["config"])
         episodes = tuple(from_json(EpisodeResult, episode) for episode in result["episodes"])
         target, references = result["summary"]["target_return"], result["references"]
+        target = None if target is None else float(target)
         minimum, expert = float(references["minimum"]), float(references["expert"])
         if len(episodes) != config.n_episodes or not -math.inf < minimum < expert < math.inf:
             raise ValueError(f"{len(episodes)} episodes, returns of {minimum} to {expert}")
         traces = read_parts(folder / "parts", [Path(name).name for name in result["parts"]])
         if len(traces["gt_reward"]) != config.n_episodes:
             raise ValueError(f"its parts hold {len(traces['gt_reward'])} episodes")
-    return Evaluation(
-        folder.parent.parent, config, None if target is None else float(target), minimum, expert, episodes, traces
-    )
+    return Evaluation(folder.parent.parent, config, target, minimum, expert, episodes, traces)
 
 
 def evaluation_folder(run: Path, config: EvaluationConfig) -> Path:
