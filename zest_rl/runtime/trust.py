@@ -12,6 +12,7 @@ from typing import Any
 
 from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.cache import cache_folder
 
 
 def remember(kind: str, named: Any) -> None:
@@ -46,4 +47,4 @@ def check_trusted(kind: str, named: Any, what: str) -> None:
 
 
 def _record(kind: str, named: Any) -> Path:
-    return artifacts.cache_dir() / "trusted" / f"{kind}-{artifacts.hash_json(named)}.json"
+    return cache_folder("trusted") / f"{kind}-{artifacts.hash_json(named)}.json"
