@@ -314,7 +314,7 @@ def test_weights_that_were_changed_are_refused(trained: Path) -> None:
             {"additional_wrappers": [{"name": "w", "entry_point": "os:system", "kwargs": {}}]},
             "would run code of 'os:system'",
         ),
-        ({"id": "CartPole-v1", "entry_point": "gymnasium.envs:CartPole"}, f"needs {ENV_ID} with a horizon, got Cart"),
+        ({"id": "CartPole-v1", "entry_point": "gymnasium.envs:CartPole"}, "steps, got CartPole-v1"),
         ({"entry_point": "zest_rl.cli:main"}, f"{ENV_ID} would run code of 'zest_rl.cli:main', but is registered as"),
         ({"max_episode_steps": None}, "with max_episode_steps None"),
     ],
