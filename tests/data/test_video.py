@@ -65,6 +65,8 @@ def test_pictures_are_taken_in_the_order_of_their_numbers(tmp_path: Path) -> Non
         Image.new("RGB", (8, 8), (20 * i, 0, 0)).save(tmp_path / f"frame{i}.png")
     assert [path.stem for path in frame_files(tmp_path)] == [f"frame{i}" for i in range(12)]
     assert [int(frame[0, 0, 0]) for frame in read_frames(tmp_path, 12)] == [20 * i for i in range(12)]
+    Image.new("RGB", (8, 8)).save(tmp_path / "²1.png")
+    assert frame_files(tmp_path)[-1].stem == "²1"
 
 
 BOTH = (lambda path: read_frames(path, 4), lambda path: list(iter_frames(path)), frame_times)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import imageio.v2 as imageio
+import imageio_ffmpeg
 import numpy as np
 import pyarrow
 import pyarrow.parquet
@@ -252,6 +253,18 @@ def test_a_video_that_lacks_a_frame_is_refused_rather_than_shifted(root: Path) -
     imageio.mimwrite(root / VIDEO, frames, fps=9, macro_block_size=2)
     with pytest.raises(BadInput, match=r"has no frame for step . of episode 1, .* info\.json says 10 per second"):
         check(root)
+
+
+def test_times_that_drift_and_a_video_that_starts_late_show_the_same_frames(root: Path, whole: Path) -> None:
+    expected = [list(check(whole).frames.read(i)) for i in range(3)]
+    drift = {f"videos/{KEY}/from_timestamp": 0.03}
+    change_rows(root / LISTING, lambda row: row.update({name: row[name] + by for name, by in drift.items()}))
+    words = ["-v", "error", "-i", root / VIDEO, "-c", "copy", "-output_ts_offset", "0.5", root / "late.mp4"]
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *words], check=True)
+    (root / "late.mp4").replace(root / VIDEO)
+    source = check(root)
+    for i, frames in enumerate(expected):
+        np.testing.assert_array_equal(list(source.frames.read(i)), frames)
 
 
 def test_a_folder_of_any_name_is_read_in_any_locale(root: Path) -> None:

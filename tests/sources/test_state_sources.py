@@ -32,6 +32,7 @@ from rollouts import (
 
 from zest_rl import cli
 from zest_rl.data import reader
+from zest_rl.errors import BadInput
 from zest_rl.sources import open_source
 from zest_rl.sources.stage import stage_of
 from zest_rl.types import Frame
@@ -343,3 +344,9 @@ def test_another_package_rebuilds_the_states_of_its_own_environment(
         register(function)
         code, error = refusal(*words)
         assert (code, f"{function}, which is registered for OwnReacher-v0, {message}" in error) == (1, True), error
+
+
+@pytest.mark.parametrize("spec", ["[]", "1", "null", '"x"', "{}", "[" * 100_000, "no JSON"])
+def test_an_env_spec_of_another_form_is_refused(spec: str) -> None:
+    with pytest.raises(BadInput, match="is not the JSON of a Gymnasium EnvSpec"):
+        stage_of(spec, ())

@@ -8,11 +8,14 @@ from pathlib import Path
 
 import imageio.v2 as imageio
 import numpy as np
+import pytest
 from PIL import Image
 from read_dataset import read
 from rollouts import Episode, Run, expected_scores, write_blind
 
 from zest_rl.data.reader import Dataset
+from zest_rl.errors import BadInput
+from zest_rl.sources.videos import find_videos
 from zest_rl.types import Frame
 
 
@@ -68,3 +71,13 @@ def test_one_frame_may_be_missing_at_the_end_and_no_more(
     shutil.rmtree(tmp_path / "films" / "episode_1")
     code, error = refusal(*words)
     assert (code, "1 are missing, the first is 1" in error) == (2, True)
+
+
+def test_what_is_no_video_file_is_refused_before_it_is_hashed(tmp_path: Path) -> None:
+    (tmp_path / "episode_0.mp4").symlink_to("/dev/zero")
+    with pytest.raises(BadInput, match=r"episode_0\.mp4 is not a file"):
+        find_videos([tmp_path], 1, "it")
+    (tmp_path / "episode_0.mp4").unlink()
+    (tmp_path / "episode_0.mp4").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    with pytest.raises(BadInput, match=r"episode_0\.mp4 is a Git LFS pointer"):
+        find_videos([tmp_path], 1, "it")

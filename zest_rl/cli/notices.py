@@ -13,18 +13,19 @@ from zest_rl.errors import Notice
 
 @contextmanager
 def notices_by(ui: Ui) -> Iterator[None]:
-    """Let `ui` tell each `Notice`, which Python would print with the line of code that it comes from."""
+    """Let `ui` tell each `Notice` once, which Python would print with the line of code that it comes from."""
     with warnings.catch_warnings():
-        show = warnings.showwarning
+        show, told = warnings.showwarning, set[str]()
 
         def tell(
             message: Warning | str, category: type[Warning], filename: str, lineno: int,
             file: TextIO | None = None, line: str | None = None,
         ) -> None:  # fmt: skip
-            if issubclass(category, Notice):
-                ui.warn(str(message))
-            else:
+            if not issubclass(category, Notice):
                 show(message, category, filename, lineno, file, line)
+            elif (text := str(message)) not in told:
+                told.add(text)
+                ui.warn(text)
 
         warnings.showwarning = tell
         yield

@@ -167,7 +167,7 @@ def frame_files(folder: Path) -> list[Path]:
     """
 
     def numbers(path: Path) -> list[int | str]:
-        return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
+        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)]
 
     return sorted(list_images(folder), key=numbers)
 

@@ -105,7 +105,7 @@ def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
     """
     try:
         spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise BadInput(f"the dataset's env_spec is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
     plugin = state_plugins.registered(spec.id)
     if plugin is not None and spec.id not in gymnasium.registry:
