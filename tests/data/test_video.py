@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from zest_rl.data import video
 from zest_rl.data.video import frame_files, frame_times, iter_frames, read_frames
-from zest_rl.errors import BadInput
+from zest_rl.errors import BadInput, ZestError
 
 N = 12
 
@@ -133,6 +134,22 @@ def test_a_part_of_a_video_is_read_by_the_times_of_its_frames(bar: list[np.ndarr
     np.testing.assert_array_equal(list(iter_frames(path, 0.45, 3)), frames[5:8])
     with pytest.raises(BadInput, match="it holds no frame after 9 s"):
         list(iter_frames(path, 9.0))
+
+
+def test_an_ffmpeg_that_hangs_or_is_missing_is_told(
+    bar: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    imageio.mimwrite(tmp_path / "bar.mp4", bar, fps=12)
+    (tmp_path / "ffmpeg").write_text("#!/bin/sh\nexec sleep 60\n")
+    (tmp_path / "ffmpeg").chmod(0o755)
+    monkeypatch.setattr(video, "PATIENCE", 0.2)
+    for name, message in (
+        ("ffmpeg", r"did not go on with .*bar\.mp4 for 0\.2 s"),
+        ("none", "ffmpeg cannot be started"),
+    ):
+        monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / name))
+        with pytest.raises(ZestError, match=message):
+            frame_times(tmp_path / "bar.mp4")
 
 
 def test_too_few_frames_are_refused(tmp_path: Path) -> None:

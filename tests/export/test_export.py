@@ -25,7 +25,7 @@ from zest_rl import cli
 from zest_rl.data import reader
 from zest_rl.data.observations import is_numbers
 from zest_rl.data.reader import Dataset
-from zest_rl.errors import BadInput, ZestError
+from zest_rl.errors import BadInput, Notice, ZestError
 from zest_rl.export import WRITERS, Format, export, transitions
 from zest_rl.export.lerobot import DATA_FILE
 from zest_rl.export.transitions import shape_rewards
@@ -438,6 +438,24 @@ def test_infos_are_not_measured_by_the_space_of_the_observations(root: Path) -> 
     with h5py.File(root / name / "data/main_data.hdf5") as file:
         assert is_numbers(file["episode_0/infos/heat"])
         assert not is_numbers(file["episode_0/observations"])
+
+
+def test_pixels_are_never_exported_as_numbers_without_a_word(root: Path, tmp_path: Path) -> None:
+    sides = {"depth": np.uint16, "labels": np.int32, "far": np.float32}
+    space = spaces.Dict(
+        {"joints": ROOM["joints"]} | {n: spaces.Box(0, 99, (9, 9), dtype) for n, dtype in sides.items()}
+    )
+    name = write_samples("room/deep-v0", root, space, spaces.Box(-1, 1, (2,), np.float32))
+    with pytest.warns(Notice) as told:
+        exported = export(name, "npz", tmp_path / "data.npz")
+    assert [str(notice.message).split(": ")[0] for notice in told] == [
+        "observations/depth is left out",
+        "observations/far counts as 81 numbers per step",
+        "observations/labels counts as 81 numbers per step",
+    ]
+    assert exported.left_out == ("observations/depth",)
+    with np.load(exported.path) as found:
+        assert found["observations"].shape == (10, 3 + 2 * 81)
 
 
 @pytest.mark.parametrize(

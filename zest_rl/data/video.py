@@ -24,7 +24,7 @@ from zest_rl.types import Frame
 VIDEO_SUFFIXES = (".avi", ".mkv", ".mov", ".mp4", ".webm")
 _CONTAINERS = "mov,matroska,webm,avi,mpegts,mpeg,ogg,flv,asf"
 """Never playlists, which make ffmpeg read other files."""
-_PATIENCE = 600
+PATIENCE = 600
 """Seconds without anything from ffmpeg after which it counts as hanging."""
 _HEADER = re.compile(rb"P6\n(\d+) (\d+)\n255\n")
 
@@ -123,8 +123,8 @@ def _read(pipe: IO[bytes], n: int, path: Path) -> bytes:
     """Read n bytes, fewer at the end."""
     parts = bytearray()
     while len(parts) < n:
-        if not select.select([pipe], [], [], _PATIENCE)[0]:
-            raise ZestError(f"ffmpeg did not go on with {path} for {_PATIENCE} s; copy it, or convert it to MP4")
+        if not select.select([pipe], [], [], PATIENCE)[0]:
+            raise ZestError(f"ffmpeg did not go on with {path} for {PATIENCE} s; copy it, or convert it to MP4")
         part = os.read(pipe.fileno(), n - len(parts))
         if not part:
             break

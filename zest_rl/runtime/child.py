@@ -5,17 +5,18 @@ from __future__ import annotations
 import errno
 import multiprocessing
 import os
+import warnings
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
-from zest_rl.errors import ZestError
+from zest_rl.errors import Notice, ZestError
 from zest_rl.runtime.parallel import cause_of_death, die_with_parent, starting_children
 
 Result = TypeVar("Result")
 
 
 def write_in_child(what: str, write: Callable[..., Result], *args: object) -> Result:
-    """Return ``write(*args)``, called in a child process: on a full disk HDF5 kills its process.
+    """Return ``write(*args)``, called in a child process: on a full disk HDF5 kills its process. A `Notice` comes here.
 
     Args:
         what: is written, for messages: "the dataset".
@@ -32,15 +33,17 @@ def write_in_child(what: str, write: Callable[..., Result], *args: object) -> Re
         child.start()
     send.close()
     try:
-        error, result = receive.recv()
+        error, result, notices = receive.recv()
     except EOFError:
         child.join()
-        error, result = f"the writing process died ({cause_of_death(child.exitcode)})", None
+        error, result, notices = f"the writing process died ({cause_of_death(child.exitcode)})", None, ()
     except KeyboardInterrupt:
         child.kill()  # it writes to a place that is removed now
         raise
     finally:
         child.join()
+    for notice in notices:
+        warnings.warn(notice, Notice, stacklevel=2)
     if isinstance(error, ZestError):
         raise error
     if error is not None:
@@ -51,12 +54,15 @@ def write_in_child(what: str, write: Callable[..., Result], *args: object) -> Re
 def _report(send: Any, write: Callable[..., Any], *args: object) -> None:
     die_with_parent()  # else it would go on writing to the files of the next attempt
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # on a full disk HDF5 prints hundreds of tracebacks
-    try:
-        result = write(*args)
-    except ZestError as error:
-        send.send((error, None))
-    except Exception as error:
-        full = os.strerror(errno.ENOSPC) in str(error)
-        send.send(("the disk is full" if full else f"{type(error).__name__}: {error}", None))
-    else:
-        send.send((None, result))
+    error: ZestError | str | None = None
+    result = None
+    with warnings.catch_warnings(record=True) as caught:
+        try:
+            result = write(*args)
+        except ZestError as refusal:
+            error = refusal
+        except Exception as failure:
+            full = os.strerror(errno.ENOSPC) in str(failure)
+            error = "the disk is full" if full else f"{type(failure).__name__}: {failure}"
+    notices = dict.fromkeys(str(warning.message) for warning in caught if issubclass(warning.category, Notice))
+    send.send((error, result, list(notices)))
