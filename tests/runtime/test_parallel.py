@@ -14,7 +14,7 @@ import pytest
 
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime.arrays import Arrays, read_arrays
-from zest_rl.runtime.parallel import cached_jobs, chunks, n_cores, one_thread, run_jobs
+from zest_rl.runtime.parallel import Engine, cached_jobs, chunks, n_cores, one_thread, run_jobs
 
 # --- work that is sent to other processes -----------------------------------------------------------------------------
 
@@ -41,6 +41,10 @@ def be_killed_after_the_first(parent: int, folder: Path, seed: int) -> Arrays:
     if os.getpid() != parent and list(folder.glob("*.npz")):
         os.kill(os.getpid(), signal.SIGKILL)
     return draw(seed)
+
+
+def be_ended_by(number: int, seed: int) -> None:
+    os.kill(os.getpid(), number)
 
 
 def wait_for_two(folder: Path) -> Arrays:
@@ -191,6 +195,22 @@ def test_a_killed_worker_is_a_clear_error_and_finished_parts_are_kept(tmp_path: 
     list(cached_jobs(work, SEEDS, tmp_path, n_workers=1))
     assert {path: path.stat().st_mtime_ns for path in finished} == finished
     assert len(list(tmp_path.glob("*.npz"))) == 4
+
+
+@pytest.mark.parametrize(
+    ("number", "cause"),
+    [(signal.SIGSEGV, "SIGSEGV: a native library crashed"), (signal.SIGKILL, "SIGKILL: killed, or out of memory")],
+)
+def test_the_message_of_a_dead_worker_names_stage_and_signal(number: int, cause: str) -> None:
+    with pytest.raises(ZestError, match=rf"a worker process died in drawing before .* \({cause}"):
+        list(run_jobs(partial(be_ended_by, number), SEEDS, n_workers=2, stage="drawing"))
+
+
+@pytest.mark.parametrize("n_workers", [0, -1, 100_000, 10**14])
+@pytest.mark.parametrize("engine", ["local", "ray"])
+def test_more_workers_than_any_machine_has_are_refused_before_one_is_started(n_workers: int, engine: Engine) -> None:
+    with pytest.raises(BadInput, match=rf"workers must be between 1 and \d+ here, got {n_workers}; leave it out"):
+        list(run_jobs(draw, SEEDS, n_workers=n_workers, engine=engine))
 
 
 def test_an_error_of_a_worker_arrives_as_what_it_is(tmp_path: Path) -> None:

@@ -77,6 +77,24 @@ def check_packages() -> Iterator[Check]:
         yield Check("packages", "ok", f"all {len(core)} as required ({versions})")
 
 
+def check_limits() -> Iterator[Check]:
+    """Check that this shell lets a process load torch and GL."""
+    from zest_rl.runtime.address_space import TORCH, check_address_space
+
+    check_address_space("torch", TORCH)
+    yield from ()
+
+
+def check_cache() -> Iterator[Check]:
+    """Check that nobody else can write to the cache."""
+    from zest_rl.runtime.artifacts import cache_dir
+    from zest_rl.runtime.cache import check_private
+
+    if cache_dir().exists():
+        check_private(cache_dir())
+    yield from ()
+
+
 def check_disk() -> Iterator[Check]:
     """Check that the folders of the cache and the datasets can be written to and have space."""
     from zest_rl.data.reader import datasets_root
@@ -153,6 +171,8 @@ def check_ffmpeg() -> Iterator[Check]:
 CHECKS: dict[str, Callable[[], Iterator[Check]]] = {
     "python": check_python,
     "packages": check_packages,
+    "limits": check_limits,
+    "cache": check_cache,
     "disk": check_disk,
     "rendering": check_rendering,
     "weights": check_weights,
@@ -162,6 +182,8 @@ CHECKS: dict[str, Callable[[], Iterator[Check]]] = {
 FIXES: dict[str, str] = {
     "python": "install Python 3.11 or newer",
     "packages": "reinstall with `pip install -e .`, or run `make setup`",
+    "limits": "ulimit -v unlimited, or ask the cluster for more memory",
+    "cache": "chmod -R go-w on that folder, or set ZEST_CACHE to one of your own",
     "disk": "set ZEST_CACHE and MINARI_DATASETS_PATH to folders that exist",
     "rendering": "install the GL libraries (Debian, Ubuntu: apt-get install libegl1 libgl1 libosmesa6), "
     "or try the other backend with MUJOCO_GL=osmesa",

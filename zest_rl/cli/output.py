@@ -12,6 +12,7 @@ from typing import Any
 
 from zest_rl.cli.interruption import INTERRUPTED, exit_code
 from zest_rl.errors import BadInput, ZestError
+from zest_rl.runtime.address_space import is_out_of_memory
 from zest_rl.training.distributed import launched
 
 
@@ -68,6 +69,8 @@ def _explain(error: BaseException) -> tuple[int, str]:
         return exit_code(error), INTERRUPTED
     if isinstance(error, ZestError):
         return 2 if isinstance(error, BadInput) else 1, str(error)
+    if is_out_of_memory(error):
+        return 1, f"the memory does not suffice ({error}); use fewer --n-workers, or raise the limit (ulimit -v)"
     if isinstance(error, OSError):
         at = f" at {error.filename}" if error.filename else ""
         if error.errno == errno.ENOSPC:

@@ -13,6 +13,7 @@ import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
 import mujoco
 
 from zest_rl.errors import ZestError
+from zest_rl.runtime.address_space import GL, check_address_space
 
 INSTALL_GL = "apt-get install libegl1 libgl1 libosmesa6"
 
@@ -44,8 +45,9 @@ def open_gl(model: mujoco.MjModel, size: int) -> tuple[Any, mujoco.MjrContext]:
     """Return a GL context, current in this thread, and MuJoCo's drawing context in it, for frames of `size` pixels.
 
     Raises:
-        ZestError: no GL backend works.
+        ZestError: no GL backend works, or ``ulimit -v`` leaves it too little.
     """
+    check_address_space("GL", GL)
     backend = select_gl_backend()
     try:
         module = f"mujoco.{backend}" if backend in ("egl", "osmesa") else "mujoco.gl_context"

@@ -174,6 +174,8 @@ def _run_in_pool(
                 done = next(as_completed(running))
                 yield running.pop(done), done.result()
         except BrokenProcessPool as error:
+            for worker in workers:
+                worker.join(10)  # the pool's own thread, which may be waiting for it, else hides the code
             codes = [worker.exitcode for worker in workers]
             first = next((code for code in codes if code not in (None, 0, -signal.SIGTERM)), None)  # ends the others
             raise ZestError(
