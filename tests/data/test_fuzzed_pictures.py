@@ -61,7 +61,7 @@ def test_damaged_jpeg_files_among_observations_are_read_or_refused(n: int) -> No
     assert counts["refused"]
 
 
-@pytest.mark.parametrize("n", [15, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [15, pytest.param(500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("suffix", ["mp4", "webm", "avi"])
 def test_damaged_videos_are_read_or_refused(suffix: str, n: int, tmp_path: Path) -> None:
     path, rng = tmp_path / f"film.{suffix}", random.Random(suffix)
