@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import io
 import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
 import pyarrow
 import pyarrow.parquet
+from PIL import Image
 from rollouts import SIDE, Episode, rows
+
+KEY = "observation.images.top"
 
 
 def write_lerobot(root: Path, maze: list[Episode], *, version: str = "v3.0", number: int = 0, step: int = 1) -> Path:
     """The layout of https://huggingface.co/docs/lerobot/lerobot-dataset-v3: two episodes in the first files."""
-    fps, key = 10, "observation.images.top"
+    fps, key = 10, KEY
     rows_of, first = [], 0
     for i, episode in enumerate(maze):
         n_steps = len(episode.actions)
@@ -82,3 +89,31 @@ def write_lerobot(root: Path, maze: list[Episode], *, version: str = "v3.0", num
     }
     (root / "meta" / "info.json").write_text(json.dumps(info))
     return root
+
+
+def change_info(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    path = root / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    change(info)
+    path.write_text(json.dumps(info))
+
+
+def change_rows(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    rows = pyarrow.parquet.read_table(path).to_pylist()
+    for row in rows:
+        change(row)
+    pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows), path)
+
+
+def store_pictures(root: Path, maze: list[Episode]) -> None:
+    """Move the frames into the data files, as LeRobot's dtype image has them."""
+    shutil.rmtree(root / "videos")
+    change_info(root, lambda info: info["features"][KEY].update(dtype="image"))
+    for path in sorted(root.glob("data/*/*.parquet")):
+
+        def add(row: dict[str, Any]) -> None:
+            buffer = io.BytesIO()
+            Image.fromarray(maze[row["episode_index"]].frames[row["frame_index"]]).save(buffer, format="PNG")
+            row[KEY] = {"bytes": buffer.getvalue(), "path": f"frame-{row['frame_index']:06d}.png"}
+
+        change_rows(path, add)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import random
+import shutil
 from pathlib import Path
 
 import pytest
 from fuzzing import damaged_bytes, damaged_json, faults, outcome
-from lerobot_files import write_lerobot
+from lerobot_files import store_pictures, write_lerobot
 from rollouts import Episode
 
 from zest_rl.sources import open_source
@@ -26,10 +27,18 @@ def root(maze: list[Episode], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_lerobot(tmp_path_factory.mktemp("whole") / "pusht", maze)
 
 
+@pytest.fixture(scope="module")
+def pictured(root: Path, maze: list[Episode]) -> Path:
+    """The same with pictures in the data files."""
+    copy = shutil.copytree(root, root.parent / "pictured")
+    store_pictures(copy, maze)
+    return copy
+
+
 @pytest.mark.parametrize("n", [20, pytest.param(500, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("what", ["info as JSON", *FILES])
-def test_damaged_lerobot_folders_are_read_or_refused(what: str, n: int, root: Path) -> None:
-    rng = random.Random(what)
+@pytest.mark.parametrize("what", ["info as JSON", *FILES, "data with pictures"])
+def test_damaged_lerobot_folders_are_read_or_refused(what: str, n: int, root: Path, pictured: Path) -> None:
+    root, rng = pictured if what == "data with pictures" else root, random.Random(what)
     path = root / FILES[what.split()[0]]
     whole = path.read_bytes()
 

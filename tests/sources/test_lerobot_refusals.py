@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
@@ -17,13 +16,12 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 import pytest
-from lerobot_files import write_lerobot
+from lerobot_files import KEY, change_info, change_rows, store_pictures, write_lerobot
 from rollouts import Episode
 
 from zest_rl.errors import BadInput, Notice
 from zest_rl.sources import Source, open_source
 
-KEY = "observation.images.top"
 LISTING, DATA = (f"{at}/chunk-000/file-000.parquet" for at in ("meta/episodes", "data"))
 VIDEO = f"videos/{KEY}/chunk-000/file-000.mp4"
 POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:" + "a" * 64 + "\nsize 123456\n"
@@ -45,20 +43,6 @@ def check(root: Path, **options: Any) -> Source:
     source = open_source(str(root), **options)
     source.trajectories.fingerprint()
     return source
-
-
-def change_info(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    path = root / "meta" / "info.json"
-    info = json.loads(path.read_text())
-    change(info)
-    path.write_text(json.dumps(info))
-
-
-def change_rows(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    rows = pyarrow.parquet.read_table(path).to_pylist()
-    for row in rows:
-        change(row)
-    pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows), path)
 
 
 @pytest.mark.parametrize("name", ["data_path", "video_path"])
@@ -168,11 +152,34 @@ def test_the_names_of_openpi_are_understood(root: Path, whole: Path) -> None:
         np.testing.assert_array_equal(ours.actions, theirs.actions)
 
 
-def test_pictures_inside_parquet_are_refused_with_what_to_do(root: Path) -> None:
-    change_info(root, lambda info: info["features"][KEY].update(dtype="image"))
+def test_pictures_in_the_data_files_are_frames(root: Path, whole: Path, maze: list[Episode]) -> None:
+    store_pictures(root, maze)
     for options in ({}, {"frames": [KEY]}):
-        with pytest.raises(BadInput, match=f"the pictures {KEY} of .* are in its parquet files.*lerobot-edit-dataset"):
-            check(root, **options)
+        source = check(root, **options)
+        assert source.trajectories.fingerprint() == check(whole).trajectories.fingerprint()
+        for i, episode in enumerate(maze):
+            np.testing.assert_array_equal([views[0] for views in source.frames.read(i)], episode.frames[:-1])
+    assert len({check(root).frames.digest(i) for i in range(3)}) == 3
+    change_rows(root / DATA, lambda row: row.pop(KEY))
+    with pytest.raises(BadInput, match=f"file-000.parquet has no column '{KEY}', as info.json says"):
+        check(root)
+
+
+@pytest.mark.parametrize(
+    ("stored", "message"),
+    [
+        ({"bytes": None, "path": "/etc/passwd"}, "of episode 0 in .* lacks a picture, or names a file elsewhere"),
+        ("/etc/passwd", "of episode 0 in .* lacks a picture, or names a file elsewhere"),
+        ({"bytes": b"%!PS-Adobe-3.0 EPSF-3.0", "path": ""}, "at step 0 of episode 0 in .* is not an image"),
+    ],
+)
+def test_a_picture_in_a_data_file_that_is_none_is_named(
+    root: Path, maze: list[Episode], stored: Any, message: str
+) -> None:
+    store_pictures(root, maze)
+    change_rows(root / DATA, lambda row: row.update({KEY: stored}))
+    with pytest.raises(BadInput, match=message):
+        list(check(root).frames.read(0))
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@
 | Minari dataset with recorded MuJoCo states, or with `--camera NAME` | copied | rendered from the model (`states`) |
 | any of these with `--frames FOLDER …` | | videos or pictures in a folder (`videos`) |
 | robomimic's HDF5 | imported (`robomimic`) | its pictures |
-| LeRobot v3 folder | imported (`lerobot`) | its videos |
+| LeRobot v3 folder | imported (`lerobot`) | its videos, or pictures (`parquet_pictures`) |
 """
 
 from __future__ import annotations

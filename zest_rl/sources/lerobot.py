@@ -6,7 +6,7 @@ Layout: https://huggingface.co/docs/lerobot/lerobot-dataset-v3, read without the
     meta/episodes/chunk-000/file-000.parquet        a row per episode: episode_index, length, data/{chunk,file}_index,
                                                     videos/KEY/{chunk_index, file_index, from_timestamp}
     data/chunk-000/file-000.parquet                 a row per frame: episode_index, observation.*, action, next.reward …
-    videos/KEY/chunk-000/file-000.mp4               one camera
+    videos/KEY/chunk-000/file-000.mp4               one camera; a feature of dtype image is a column of the data files
 
 An episode has T rows and T frames, o_0 … o_{T-1}; o_T, which is not recorded, repeats o_{T-1}. LeRobot's ``next.done``
 marks the last frame of every episode, so an episode counts as terminated if its last ``next.done`` is true and its
@@ -31,8 +31,9 @@ from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.files import check_file
 from zest_rl.sources.conversion import ConvertedEpisode, ConvertedTrajectories
-from zest_rl.sources.lerobot_meta import INFO, MAX_ROWS, OTHERS, Info, complete_episodes, read_listing
-from zest_rl.sources.parquet import as_numbers, open_parquet, read_table
+from zest_rl.sources.lerobot_meta import INFO, OTHERS, Info, complete_episodes, read_listing
+from zest_rl.sources.parquet import MAX_ROWS, as_numbers, open_parquet, read_table
+from zest_rl.sources.parquet_pictures import ParquetPictures
 from zest_rl.types import FloatArray, Frame
 
 
@@ -165,27 +166,27 @@ def is_lerobot(folder: Path) -> bool:
 
 def open_lerobot(
     root: Path, keys: Sequence[str], *, with_frames: bool = True, skip_incomplete: bool = False
-) -> tuple[ConvertedTrajectories, Videos | None]:
+) -> tuple[ConvertedTrajectories, Videos | ParquetPictures | None]:
     """Open a LeRobot folder.
 
     Args:
         root: the folder.
-        keys: features that are the frames, one per view; empty: the only video.
+        keys: features that are the frames, one per view; empty: the only video or picture.
         with_frames: False where the frames are elsewhere.
         skip_incomplete: leave out episodes without steps, and those whose files are missing; a `Notice` names them.
 
     Returns:
-        The episodes; and their videos, None without any or without `with_frames`.
+        The episodes; and their frames, None without any or without `with_frames`.
 
     Raises:
         BadInput: another version, pyarrow is not installed, a file is missing or damaged, a video does not show every
-            step, or the choice of videos is ambiguous.
+            step, or the choice of frames is ambiguous.
     """
     root = root.resolve()
     info = Info.read(root)
-    views = info.choose_views(keys, root) if with_frames else []
+    views, are_videos = info.choose_views(keys, root) if with_frames else ([], False)
     columns = info.columns(root)
-    listed = complete_episodes(root, read_listing(root, info, views), skip_incomplete)
+    listed = complete_episodes(root, read_listing(root, info, views if are_videos else []), skip_incomplete)
     by_file = groupby(listed, lambda episode: episode.data)
     files = tuple((file, tuple(episode.number for episode in episodes)) for file, episodes in by_file)
     for path in {root / name for e in listed for name in (e.data, *(name for name, _ in e.videos))}:
@@ -194,8 +195,11 @@ def open_lerobot(
     n_listed = Counter[str]()
     for episode in listed:
         n_listed[episode.data] += episode.n_steps
+    stored = set() if are_videos else set(views)
     for file, n in n_listed.items():
         with open_parquet(root / file, MAX_ROWS) as opened:
+            if missing := stored - set(opened.schema_arrow.names):
+                raise BadInput(f"{root / file} has no column {min(missing)!r}, as info.json says; download it again")
             if opened.metadata.num_rows < n:
                 raise BadInput(
                     f"{root / file} has {opened.metadata.num_rows} rows, but meta/episodes lists {n} of them; download "
@@ -206,6 +210,8 @@ def open_lerobot(
     trajectories = ConvertedTrajectories(root, "LeRobot", n_steps, n_bytes, read, info.fps)
     if not views:
         return trajectories, None
+    if not are_videos:
+        return trajectories, ParquetPictures(tuple(views), tuple((root / e.data, e.number) for e in listed))
     spans = tuple(tuple(Span(root / name, start, e.n_steps) for name, start in e.videos) for e in listed)
     videos = Videos(tuple(views), info.fps, spans)
     videos.check([episode.number for episode in listed])

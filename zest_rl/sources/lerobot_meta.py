@@ -15,13 +15,11 @@ from zest_rl.data.picture_forms import PictureForm
 from zest_rl.errors import BadInput, Notice, ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.files import is_there, path_under
-from zest_rl.sources.parquet import read_table
+from zest_rl.sources.parquet import MAX_ROWS, read_table
 
 INFO = Path("meta", "info.json")
 OTHERS = ("action", "next.reward", "next.done", "next.truncated", "next.success")
 """Features that are read besides what is observed."""
-MAX_ROWS = 10**8
-"""Of one file, far beyond any of this format, which has at most 100 MB: more is damage."""
 _MAX_EPISODES, _MAX_FPS = 10**6, 10_000
 _NUMBERS = ("float16", "float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool")
 _BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index", "actions")
@@ -113,17 +111,19 @@ class Info:
             raise BadInput(f"{root} has no feature 'action', got {', '.join(self.features)}; rename it in info.json")
         return observed | others
 
-    def choose_views(self, keys: Sequence[str], root: Path) -> list[str]:
-        """Return the videos that are the frames: those asked for, else the only one; none if there is none."""
-        kinds = {name: "" if _is_depth(facts) else facts["dtype"] for name, facts in self.features.items()}
-        videos = {name: PictureForm(3) for name, kind in kinds.items() if kind == "video"}
-        images = [name for name, kind in kinds.items() if kind == "image"]
-        if stored := [name for name in images if name in keys or not (keys or videos)]:
-            raise BadInput(
-                f"the pictures {', '.join(stored)} of {root} are in its parquet files, which is not read; convert them "
-                "to videos with lerobot-edit-dataset, or give --frames FOLDER with a video of each episode"
-            )
-        return choose_pictures(videos, keys, str(root)) if keys or videos else []
+    def choose_views(self, keys: Sequence[str], root: Path) -> tuple[list[str], bool]:
+        """Return the features that are the frames, and whether they are videos rather than pictures in the data files.
+
+        Those are taken that are asked for, else the only video, else the only picture; none if there is neither.
+        """
+        kinds = {name: facts["dtype"] for name, facts in self.features.items() if not _is_depth(facts)}
+        taken = ("video",) if not keys and "video" in kinds.values() else ("video", "image")
+        forms = {name: PictureForm(3) for name, kind in kinds.items() if kind in taken}
+        views = choose_pictures(forms, keys, str(root)) if keys or forms else []
+        chosen = {kinds[view] for view in views}
+        if len(chosen) > 1:
+            raise BadInput(f"the views must be all videos or all pictures, got {', '.join(views)}")
+        return views, chosen == {"video"}
 
     def listed(self, row: Mapping[str, Any], views: Sequence[str]) -> ListedEpisode:
         """Read a row of ``meta/episodes``; raises what `int`, `float` and missing keys raise."""

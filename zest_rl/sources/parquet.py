@@ -13,6 +13,9 @@ from zest_rl.errors import BadInput
 from zest_rl.runtime.files import check_file
 from zest_rl.types import FloatArray
 
+MAX_ROWS = 10**8
+"""Of one file, far beyond any of LeRobot, which has at most 100 MB: more is damage."""
+
 
 @contextmanager
 def open_parquet(path: Path, max_rows: int) -> Iterator[Any]:
