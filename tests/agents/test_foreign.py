@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import fields
 from pathlib import Path
@@ -415,6 +416,51 @@ def test_what_cannot_be_read_is_refused_and_leaves_no_folder(
         got, message = refusal("adopt", spec, "--dataset", collected, "--run-dir", tmp_path / "runs" / "x")
         assert (got, complaint in message) == (code, True), message
     assert not [path for path in (tmp_path / "runs").iterdir() if path.suffix != ".lock"]
+
+
+class Several(nn.Module):
+    """Actions and values, as stable-baselines3's policies give them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.act, self.value = nn.Linear(59, 9), nn.Linear(59, 1)
+
+    def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        return self.act(obs).clip(-1, 1), self.value(obs)
+
+
+@pytest.mark.parametrize("kind", ["torchscript", "onnx"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_first_of_several_outputs_are_the_actions_in_any_precision(
+    kind: str, dtype: torch.dtype, adopt: Callable[..., Path], tmp_path: Path
+) -> None:
+    module, path = Several().eval().to(dtype), tmp_path / f"p.{kind}"
+    if kind == "torchscript":
+        torch.jit.trace(module, torch.zeros(1, 59, dtype=dtype)).save(str(path))
+    else:
+        names = {"input_names": ["observation"], "output_names": ["actions", "values"]}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            torch.onnx.export(module, (torch.zeros(1, 59, dtype=dtype),), str(path), dynamo=False, **names)
+    policy = load_policy(adopt(f"{kind}:{path}"))
+    obs = np.random.default_rng(0).normal(size=(3, 59)).astype(np.float32)
+    policy.begin(3)
+    with torch.no_grad():
+        expected = module(torch.from_numpy(obs).to(dtype))[0].float().numpy()
+    np.testing.assert_allclose(policy.act(obs), expected, atol=1e-5)
+
+
+def test_a_torchscript_without_actions_is_told_what_it_must_return(
+    collected: str, refusal: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    class Named(nn.Module):
+        def forward(self, obs: Tensor) -> dict[str, Tensor]:
+            return {"actions": obs[:, :9]}
+
+    torch.jit.trace(Named(), torch.zeros(1, 59), strict=False).save(str(tmp_path / "p.pt"))
+    code, message = refusal("adopt", f"torchscript:{tmp_path / 'p.pt'}", "--dataset", collected)
+    assert (code, "its output must be a tensor of actions or begin with one, got dict" in message) == (1, True)
 
 
 def test_a_graph_that_takes_other_observations_is_named_in_one_line(

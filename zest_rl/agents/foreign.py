@@ -2,14 +2,15 @@
 
 | spec | policy |
 |---|---|
-| `torchscript:FILE.pt` | a TorchScript module or function, as d3rlpy's `save_policy("FILE.pt")` writes it |
+| `torchscript:FILE.pt` | a TorchScript module, as d3rlpy's `save_policy("FILE.pt")` writes it |
 | `onnx:FILE.onnx` | an ONNX graph of one input (extra `foreign`); external weights lie in `FILE.onnx.data` |
 | `d3rlpy:FILE.d3` | a d3rlpy model, run in a separate process by a Python that has d3rlpy |
 | `command:WORDS …` | any program that speaks the protocol of `zest_rl.agents.child` |
 | `NAME:REST` | an entry point of another package (group `zest_rl.policies`): a function from REST to a callable |
 
-All of them map raw observations (N, obs_dim) float32, as in the dataset, to actions (N, act_dim) in [-1, 1]. If a
-callable or a TorchScript module has a method `begin(n_episodes)`, it is called when N new episodes start.
+All of them map raw observations (N, obs_dim), as in the dataset, to actions (N, act_dim) in [-1, 1]: the first output
+of TorchScript or ONNX that has several; one that computes in double gets double. If a callable or a TorchScript module has a
+method `begin(n_episodes)`, it is called when N new episodes start.
 
 Nothing is unpickled in this process; but TorchScript, ONNX, commands and packages run their authors' code, and d3rlpy
 unpickles its models in its own process. So `load` wants each to be trusted (`zest_rl.runtime.trust`).
@@ -324,12 +325,20 @@ def _read_torchscript(path: Path, device: torch.device) -> Act:
 class _TorchScript:
     def __init__(self, module: Any, device: torch.device):
         self._module, self._device = module, device
+        dtypes = {weight.dtype for weight in module.state_dict().values() if weight.is_floating_point()}
+        self._dtype = dtypes.pop() if len(dtypes) == 1 else torch.float32
         if hasattr(module, "begin"):
             self.begin = module.begin
 
     @torch.no_grad()
     def __call__(self, obs: FloatArray) -> NDArray[Any]:
-        actions: torch.Tensor = self._module(torch.from_numpy(obs).to(self._device))
+        output = self._module(torch.from_numpy(obs).to(self._device, self._dtype))
+        actions = output[0] if isinstance(output, tuple | list) else output  # then values or log-probabilities follow
+        if not isinstance(actions, torch.Tensor):
+            raise ZestError(
+                f"its output must be a tensor of actions or begin with one, got {type(output).__name__}; wrap it in a "
+                "module that returns the actions alone"
+            )
         return actions.float().cpu().numpy()
 
 
@@ -355,12 +364,15 @@ def _read_onnx(path: Path) -> Act:
             f"an ONNX policy must have one input, the observations, got {', '.join(node.name for node in inputs)}; "
             "serve others by command:"
         )
-    run = partial(_run_onnx, session, inputs[0].name)
+    dtypes = {"tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(float16)": np.float16}
+    if inputs[0].type not in dtypes:
+        raise BadInput(f"the input of an ONNX policy must be {', '.join(dtypes)}, got {inputs[0].type}")
+    run = partial(_run_onnx, session, inputs[0].name, dtypes[inputs[0].type])
     return run if inputs[0].shape[:1] != [1] else lambda obs: np.concatenate([run(row[None]) for row in obs])
 
 
-def _run_onnx(session: Any, name: str, obs: FloatArray) -> NDArray[Any]:
-    actions: NDArray[Any] = session.run(None, {name: obs})[0]
+def _run_onnx(session: Any, name: str, dtype: Any, obs: FloatArray) -> NDArray[Any]:
+    actions: NDArray[Any] = session.run(None, {name: obs.astype(dtype)})[0]  # then values or log-probabilities follow
     return actions
 
 
