@@ -8,7 +8,7 @@ from dataclasses import replace
 import gymnasium
 import pytest
 
-from zest_rl.data.env_specs import check_env_spec, check_registered, entry_points
+from zest_rl.data.env_specs import check_env_spec, check_registered, entry_points, without_wrappers
 from zest_rl.errors import BadInput
 
 
@@ -37,5 +37,18 @@ def test_an_id_stands_for_the_code_that_is_registered_under_it() -> None:
     check_registered(spec)
     with pytest.raises(BadInput, match=r"would run code of 'gymnasium\.spaces:Box', but is registered as"):
         check_registered(replace(spec, entry_point="gymnasium.spaces:Box"))
-    with pytest.raises(BadInput, match="is not registered here; install the version of its package"):
+    with pytest.raises(
+        BadInput, match="Nowhere-v1 is not registered by the packages that are installed here; install the version"
+    ):
         check_registered(replace(spec, id="Nowhere-v1"))
+
+
+def test_an_id_of_an_old_version_is_told_with_the_versions_that_are_there() -> None:
+    with pytest.raises(BadInput, match=r"CartPole-v9 is not registered .* here, which have CartPole-v0, CartPole-v1; "):
+        check_registered(replace(gymnasium.spec("CartPole-v1"), id="CartPole-v9"))
+
+
+def test_no_wrappers_may_be_written_as_null() -> None:
+    spec = json.dumps({"entry_point": "gymnasium.envs.x:Y", "additional_wrappers": None})
+    assert entry_points(spec, "it") == ["gymnasium.envs.x:Y"]
+    assert json.loads(without_wrappers(spec))["additional_wrappers"] == []

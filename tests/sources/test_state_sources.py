@@ -266,6 +266,14 @@ def test_wrapped_observations_are_not_taken_for_the_state_and_wrappers_are_not_r
     assert len(list(open_source("maze/state-True-v0").frames.read(0))) == LENGTHS[0] + 1
 
 
+def test_wrappers_of_other_packages_are_left_out_where_the_state_is_recorded(maze: list[Episode]) -> None:
+    dataset = write_states("maze/wrapped-v0", "PointMaze_UMaze-v3", maze[:1], with_state=True)
+    edit_spec(dataset, additional_wrappers=[{"name": "Theirs", "entry_point": "their_package:Wrapper", "kwargs": {}}])
+    assert len(list(open_source(dataset).frames.read(0))) == LENGTHS[0] + 1
+    edit_spec(dataset, additional_wrappers=None)
+    assert len(list(open_source(dataset).frames.read(0))) == LENGTHS[0] + 1
+
+
 def test_targets_that_only_a_renderer_places_are_refused(goal: Path, refusal: Callable[..., tuple[int, str]]) -> None:
     dataset = write_states("hand/random-v0", "HandReach-v3", roll_out("HandReach-v3", (1,)))
     code, error = refusal("relabel", dataset, "--goal", goal)

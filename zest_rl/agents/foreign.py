@@ -8,9 +8,9 @@
 | `command:WORDS …` | any program that speaks the protocol of `zest_rl.agents.child` |
 | `NAME:REST` | an entry point of another package (group `zest_rl.policies`): a function from REST to a callable |
 
-All of them map raw observations (N, obs_dim), as in the dataset, to actions (N, act_dim) in [-1, 1]: the first output
-of TorchScript or ONNX that has several; one that computes in double gets double. If a callable or a TorchScript module has a
-method `begin(n_episodes)`, it is called when N new episodes start.
+All of them map raw observations (N, obs_dim), as in the dataset, to actions (N, act_dim) in [-1, 1]. Of several outputs
+of TorchScript or ONNX the first are the actions; weights in double get double. If a callable or a TorchScript module
+has a method `begin(n_episodes)`, it is called when N new episodes start.
 
 Nothing is unpickled in this process; but TorchScript, ONNX, commands and packages run their authors' code, and d3rlpy
 unpickles its models in its own process. So `load` wants each to be trusted (`zest_rl.runtime.trust`).

@@ -25,7 +25,7 @@ def entry_points(env_spec: str, what: str) -> list[str]:
     """
     try:
         spec = json.loads(env_spec)
-        return [str(part["entry_point"]) for part in (spec, *spec.get("additional_wrappers", ()))]
+        return [str(part["entry_point"]) for part in (spec, *(spec.get("additional_wrappers") or ()))]
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise BadInput(f"{what} is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
 
@@ -44,7 +44,9 @@ def check_env_spec(env_spec: str, what: str, instead: str) -> None:
             )
 
 
-def check_registered(spec: EnvSpec) -> None:
+def check_registered(
+    spec: EnvSpec, instead: str = "install the version of its package that it was recorded with"
+) -> None:
     """Refuse a spec whose entry point is not the registered one: it could call any function.
 
     Raises:
@@ -53,9 +55,21 @@ def check_registered(spec: EnvSpec) -> None:
     import gymnasium
 
     registered = gymnasium.registry.get(spec.id)
-    if registered is None or spec.entry_point != registered.entry_point:
+    if registered is None:
+        name = spec.id.rpartition("-v")[0]
+        versions = sorted(other for other in gymnasium.registry if other.rpartition("-v")[0] == name)
         raise BadInput(
-            f"{spec.id} would run code of {spec.entry_point!r}, but "
-            + ("is not registered here" if registered is None else f"is registered as {registered.entry_point!r}")
-            + "; install the version of its package that it was recorded with"
+            f"{spec.id} is not registered by the packages that are installed here"
+            + (f", which have {', '.join(versions)}" if versions else "")
+            + f"; {instead}"
         )
+    if spec.entry_point != registered.entry_point:
+        raise BadInput(
+            f"{spec.id} would run code of {spec.entry_point!r}, but is registered as {registered.entry_point!r}; "
+            f"{instead}"
+        )
+
+
+def without_wrappers(env_spec: str) -> str:
+    """Return an EnvSpec (JSON) without its wrappers, which change nothing that is rendered, and would run code."""
+    return json.dumps({**json.loads(env_spec), "additional_wrappers": []})

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 import zest_rl.kitchen.env  # noqa: F401  # registers its environment, and those of gymnasium-robotics
-from zest_rl.data.env_specs import check_registered
+from zest_rl.data.env_specs import check_registered, without_wrappers
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime import artifacts
 from zest_rl.simulation.rendering import Canvas
@@ -104,14 +104,17 @@ def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
         ZestError: the environment cannot be made with the packages here, or no GL backend works.
     """
     try:
-        spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
+        spec = gymnasium.envs.registration.EnvSpec.from_json(without_wrappers(env_spec))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise BadInput(f"the dataset's env_spec is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
     plugin = state_plugins.registered(spec.id)
     if plugin is not None and spec.id not in gymnasium.registry:
         state_plugins.load(plugin)  # its module registers the environment
-    check_registered(spec)
-    spec.additional_wrappers = ()  # they change nothing that is rendered, and would run code
+    check_registered(
+        spec,
+        "install the version of its package that it was recorded with, or give --frames FOLDER with a video of each "
+        "episode",
+    )
     try:
         with redirect_stderr(StringIO()):  # on import gymnasium_robotics prints news of its other environments
             env: Any = gymnasium.make(spec, disable_env_checker=True).unwrapped

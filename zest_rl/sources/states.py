@@ -18,7 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from zest_rl.data.env_specs import check_env_spec
+from zest_rl.data.env_specs import check_env_spec, without_wrappers
 from zest_rl.data.hdf5 import check_rows, open_hdf5, read_array
 from zest_rl.data.observations import entries
 from zest_rl.errors import BadInput, ZestError
@@ -133,7 +133,8 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
     spec = json.loads(env_spec)
     plugin = state_plugins.registered(str(spec.get("id")))
     if plugin is None:
-        check_env_spec(env_spec, f"the env_spec of {what}", "give --frames FOLDER with a video of each episode")
+        code = without_wrappers(env_spec)
+        check_env_spec(code, f"the env_spec of {what}", "give --frames FOLDER with a video of each episode")
     row = recorded_env(str(spec["entry_point"]))
     with open_hdf5(file) as opened:
         group = opened[episodes[0]]
