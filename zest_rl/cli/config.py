@@ -59,7 +59,7 @@ def read_recipe(path: Path) -> dict[str, Any]:
         raise BadInput(f"there is no recipe {path}; {nearest(path.name, others)}")
     try:
         return tomllib.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise BadInput(f"recipe {path} is not TOML: {error}") from error
 
 
@@ -287,7 +287,7 @@ def _read_table(config_class: type[Any], recipe: Mapping[str, Any]) -> tuple[dic
         else:
             try:
                 values[field] = _convert(value, arguments[field].kind)
-            except TypeError:
+            except (TypeError, OverflowError):
                 problems.append(f"{key!r} must be {_describe(arguments[field].kind)}, got {value!r}")
     return values, problems
 
