@@ -7,6 +7,7 @@ import random
 from pathlib import Path
 
 import pytest
+import torch
 from fuzzing import damaged_bytes, damaged_json, faults, outcome, outcomes
 
 from zest_rl.agents import load_policy
@@ -15,6 +16,7 @@ from zest_rl.report.methods import methods_of_runs
 from zest_rl.rewards.scorer import SCORER_FILE, check_scorer
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.artifacts import hash_json
+from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint
 
 COUNTS = [60, pytest.param(1500, marks=pytest.mark.slow)]
 
@@ -93,6 +95,42 @@ def test_a_damaged_result_of_an_evaluation_is_read_or_refused(n: int, trained: P
     assert first.kind == "read", first.detail
     counts, bad = faults(others)
     print("result.json", n, dict(counts))
+    assert not bad, bad[0].detail
+
+
+@pytest.mark.parametrize("n", COUNTS)
+def test_a_damaged_checkpoint_of_a_training_is_read_or_refused_even_under_its_own_manifest(
+    n: int, tmp_path: Path
+) -> None:
+    def state() -> TrainState:
+        torch.manual_seed(0)
+        return TrainState.start(torch.nn.Linear(3, 2), 0.0, 0)
+
+    first = state()
+    first.model(torch.ones(1, 3)).sum().backward()
+    first.optimizer.step()
+    save_checkpoint(tmp_path, first)
+    (folder,) = (tmp_path / "checkpoints").iterdir()
+    whole = {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "manifest.json"}
+    progress, rng = json.loads(whole["state.json"]), random.Random(0)
+    damaged = [("state.json", whole["state.json"])]
+    for _ in range(n):
+        name = rng.choice(sorted(whole))
+        damaged.append((name, damaged_bytes(whole[name], rng)))
+        damaged.append(("state.json", json.dumps(damaged_json(progress, rng)).encode()))
+
+    def read(i: int) -> int:
+        for name, content in (whole | dict([damaged[i]])).items():
+            (folder / name).write_bytes(content)
+        artifacts.write_json(folder / "manifest.json", {name: artifacts.hash_file(folder / name) for name in whole})
+        restored = state()
+        resume(tmp_path, restored)
+        return restored.update
+
+    honest, *others = outcomes(read, len(damaged))
+    counts, bad = faults(others)
+    print("checkpoint", len(others), dict(counts))
+    assert honest.kind == "read", honest.detail
     assert not bad, bad[0].detail
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 
 from zest_rl.errors import ZestError
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.records import reading_record
 
 N_CHECKPOINTS = 2
 
@@ -113,8 +115,12 @@ def resume(run_dir: Path, state: TrainState) -> None:
     folders = _checkpoints(run_dir)
     if not folders:
         return
-    folder = folders[-1]
-    _verify(folder)
+    _verify(folders[-1])
+    with reading_record(folders[-1], "delete this folder and start the run again, or train into a new one"):
+        _restore(folders[-1], state)
+
+
+def _restore(folder: Path, state: TrainState) -> None:
     tensors = {
         name: safetensors.torch.load_file(folder / f"{name}.safetensors")
         for name in ("model", "optimizer", "average", "generators")
@@ -122,18 +128,21 @@ def resume(run_dir: Path, state: TrainState) -> None:
     state.model.load_state_dict(tensors["model"])
     for name, mean in state.average.items():
         mean.copy_(tensors["average"][name])
-    moments: dict[int, dict[str, Tensor]] = {i: {} for i in range(len(state.params))}
-    places = {name: i for i, name in enumerate(state.params)}
+    parameters = state.params
+    moments: dict[int, dict[str, Tensor]] = {i: {} for i in range(len(parameters))}
+    places = {name: i for i, name in enumerate(parameters)}
     for full_name, tensor in tensors["optimizer"].items():
         name, _, key = full_name.rpartition("/")
+        if tensor.shape not in ((), parameters[name].shape):
+            raise ValueError(f"{full_name} has shape {tuple(tensor.shape)}")
         moments[places[name]][key] = tensor.clone()
     state.optimizer.load_state_dict({"state": moments, "param_groups": state.optimizer.state_dict()["param_groups"]})
     torch.set_rng_state(tensors["generators"]["cpu"])
     if "cuda" in tensors["generators"]:
         torch.cuda.set_rng_state(tensors["generators"]["cuda"], next(state.model.parameters()).device)
     progress = artifacts.read_json(folder / "state.json")
-    state.update, state.seconds = progress["update"], progress["seconds"]
-    state.recent = [(loss, norm) for loss, norm in progress["recent"]]
+    state.update, state.seconds = operator.index(progress["update"]), float(progress["seconds"])
+    state.recent = [(float(loss), float(norm)) for loss, norm in progress["recent"]]
     state.rng.bit_generator.state = progress["sampler"]
 
 
