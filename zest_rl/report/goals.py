@@ -56,5 +56,8 @@ def goal_panel(name: str, record: RelabelRecord, folder: Path, scatter: Scatter 
     if not (spec == TASK_TEXT or spec.startswith(TEXT)):  # a dataset names no other folders to read
         raise BadInput(f"{folder} lacks the pictures of its goal, {GOAL_FOLDER}/; relabel it again")
     sentences = read_text(spec) if views is None else read_goal(spec, get_task(views["task"]))
-    kept = range(len(sentences.goals)) if record.kept_goals is None else record.kept_goals
+    n_goals = len(sentences.goals)
+    kept = range(n_goals) if record.kept_goals is None else record.kept_goals
+    if not set(kept) <= set(range(n_goals)):
+        raise BadInput(f"kept_goals in {folder} must be of the {n_goals} goals of {spec!r}, got {record.kept_goals}")
     return GoalPanel(name, sentences.starts, tuple(sentences.goals[k] for k in kept), *ranking)
