@@ -43,8 +43,8 @@ def check_finite(what: str, array: NDArray[Any]) -> NDArray[Any]:
     Raises:
         BadInput: NaN or infinity, of which the first row is named.
     """
-    bad = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))
-    if len(bad):
+    if not np.isfinite(array).all():
+        bad = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))
         raise BadInput(
             f"{what} must be finite, but {len(bad)} of {len(array)} rows hold NaN or infinity "
             f"(the first at index {bad[0]}); repair or drop the episode before using the dataset"

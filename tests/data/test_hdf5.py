@@ -33,7 +33,10 @@ def put(name: str) -> Callable[[Callable[[h5py.File], Any]], Spoil]:
 REACH_OUT: dict[str, tuple[Spoil, str]] = {
     "external link": (put("/x")(lambda file: h5py.ExternalLink("other.hdf5", "/rewards")), "x is an external link"),
     "external link to a group": (put("/x")(lambda file: h5py.ExternalLink("other.hdf5", "/")), "x is an external link"),
-    "soft link": (put("/x")(lambda file: h5py.SoftLink("/plain")), "x is a soft link, not data; store it as one plain"),
+    "soft link": (
+        put("/x")(lambda file: h5py.SoftLink("/plain")),
+        "x is a soft link, not data; copy the data themselves",
+    ),
     "dangling soft link": (put("/x")(lambda file: h5py.SoftLink("/nowhere")), "x is a soft link"),
     "hard link": (put("/x")(lambda file: file["plain"]), "is a second name of something else in the file"),
     "cycle": (put("/x")(lambda file: file["/"]), "x is a second name of something else in the file"),

@@ -8,6 +8,7 @@ change them. No dataset needs any of it, so a file with one of these is refused 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -30,7 +31,7 @@ MAX_DEPTH = 32
 _FREE = 64 * 2**20  # bytes of an array that need not be stored, as values that were never written are not
 _EXTERNAL_STORAGE, _FILTERS = 1 << 7, 1 << 11  # messages of an object's header
 _LINKS = {h5l.TYPE_SOFT: "a soft link", h5l.TYPE_EXTERNAL: "an external link"}
-_REPACK = "store it as one plain file: `h5repack`, or h5py's `copy(…, expand_soft=True, expand_external=True)`"
+_REPACK = "copy the data themselves to a file (h5py: `copy(…, expand_soft=True, expand_external=True)`)"
 
 
 @contextmanager
@@ -96,9 +97,10 @@ def check_rows(name: str, node: h5py.Dataset, n_steps: int, n_more: int = 0) -> 
 
 def check_stored(node: h5py.Dataset) -> None:
     """Raise `BadInput` if an array is larger than what is stored of it can be."""
-    if node.nbytes > _FREE and node.nbytes > MAX_RATIO * node.id.get_storage_size():
+    n_bytes = math.prod(node.shape or ()) * node.id.get_type().get_size()
+    if n_bytes > _FREE and n_bytes > MAX_RATIO * node.id.get_storage_size():
         raise BadInput(
-            f"{node.name} declares {node.nbytes:,} bytes of shape {node.shape}, of which {node.id.get_storage_size():,}"
+            f"{node.name} declares {n_bytes:,} bytes of shape {node.shape}, of which {node.id.get_storage_size():,}"
             " are stored; the file is damaged or incomplete, download it or make it again"
         )
 

@@ -19,7 +19,6 @@ truth; a relabeled copy keeps their own rewards as ``infos/source/{reward, succe
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,14 +30,15 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.data.episode_arrays import EpisodeArrays
 from zest_rl.data.folders import DATA_FILE, MANIFEST_FILE, METADATA_FILE, verified_metadata
 from zest_rl.data.folders import DATASET_ID as DATASET_ID
 from zest_rl.data.folders import dataset_path as dataset_path
 from zest_rl.data.folders import datasets_root as datasets_root
 from zest_rl.data.folders import exists as exists
 from zest_rl.data.folders import list_datasets as list_datasets
-from zest_rl.data.hdf5 import check_rows, mapped_errors, open_hdf5, read_array
-from zest_rl.data.observations import acts_discretely, entries, is_numbers, numbers, stored_rows
+from zest_rl.data.hdf5 import mapped_errors, open_hdf5, read_array
+from zest_rl.data.observations import is_numbers, stored_rows
 from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
@@ -93,12 +93,12 @@ class Dataset:
             ZestError: the file is damaged.
         """
 
-        def read(group: h5py.Group) -> Episode:
+        def read(arrays: EpisodeArrays) -> Episode:
             return Episode(
-                obs=self._observations(group),
-                actions=self._actions(group, discrete),
-                rewards=self._array(group, "rewards"),
-                terminated=self._is_terminated(group),
+                obs=arrays.observations(),
+                actions=arrays.actions(discrete),
+                rewards=arrays.read("rewards"),
+                terminated=arrays.is_terminated(),
             )
 
         episodes = self._each(read)
@@ -115,7 +115,7 @@ class Dataset:
         Raises:
             BadInput: there are none, or as in `episodes`.
         """
-        return self._each(lambda group: self._array(group, "rewards"))
+        return self._each(lambda arrays: arrays.read("rewards"))
 
     def states(self) -> list[NDArray[np.float64]]:
         """Read the simulator positions (T+1, nq) of every episode.
@@ -123,7 +123,7 @@ class Dataset:
         Raises:
             BadInput: no recorded state, lengths that do not fit, NaN.
         """
-        states = self._each(lambda group: self._array(group, _QPOS, np.float64, n_more=1, ndim=2))
+        states = self._each(lambda arrays: arrays.read(_QPOS, np.float64, n_more=1, ndim=2))
         self._check_alike([qpos.shape[1:] for qpos in states])
         return states
 
@@ -134,12 +134,11 @@ class Dataset:
             BadInput: an episode holds other than T or, with the reset's, T+1 of them.
         """
 
-        def read(group: h5py.Group) -> NDArray[np.bool_]:
-            name = next(name for name in SUCCESS if name in group)
-            n_steps = self.lengths[group.name.strip("/")]
-            n_more = int((getattr(group[name], "shape", None) or ())[:1] == (n_steps + 1,))
-            values = self._array(group, name, n_more=n_more, ndim=None)
-            return values[n_more:].reshape(n_steps, -1)[:, 0].astype(bool)
+        def read(arrays: EpisodeArrays) -> NDArray[np.bool_]:
+            name = next(name for name in SUCCESS if name in arrays.group)
+            n_more = int((getattr(arrays.group[name], "shape", None) or ())[:1] == (arrays.n_steps + 1,))
+            values = arrays.read(name, n_more=n_more, ndim=None)
+            return values[n_more:].reshape(arrays.n_steps, -1)[:, 0].astype(bool)
 
         if not all(any(name in group for name in SUCCESS) for group in self.groups.values()):
             return None
@@ -157,9 +156,9 @@ class Dataset:
             BadInput: no ground truth is recorded.
         """
         return self._each(
-            lambda group: GroundTruth(
-                rewards=self._array(group, _GT_REWARD, n_more=1)[1:],
-                success=bool(self._array(group, "infos/gt/success", n_more=1).any()),
+            lambda arrays: GroundTruth(
+                rewards=arrays.read(_GT_REWARD, n_more=1)[1:],
+                success=bool(arrays.read("infos/gt/success", n_more=1).any()),
             )
         )
 
@@ -169,7 +168,7 @@ class Dataset:
         Raises:
             BadInput: the dataset was not relabeled, or as in `episodes`.
         """
-        return self._each(lambda group: self._array(group, "infos/zest/score", n_more=1))
+        return self._each(lambda arrays: arrays.read("infos/zest/score", n_more=1))
 
     def source_rewards(self) -> list[FloatArray] | None:
         """Read the rewards (T,) that a dataset of another environment had before it was relabeled; None without any.
@@ -178,17 +177,17 @@ class Dataset:
         """
         if not all(SOURCE_REWARD in group for group in self.groups.values()):
             return None
-        return self._each(lambda group: self._array(group, SOURCE_REWARD, n_more=1, finite=False)[1:])
+        return self._each(lambda arrays: arrays.read(SOURCE_REWARD, n_more=1, finite=False)[1:])
 
     def rewards_to_keep(self) -> list[FloatArray | None]:
         """Read the original rewards (T,) that a relabeled copy keeps, NaN included; None for ground truth or none."""
 
-        def read(group: h5py.Group) -> FloatArray | None:
-            if _GT_REWARD in group:
+        def read(arrays: EpisodeArrays) -> FloatArray | None:
+            if _GT_REWARD in arrays.group:
                 return None
-            if SOURCE_REWARD in group:
-                return self._array(group, SOURCE_REWARD, n_more=1, finite=False)[1:]
-            return self._array(group, "rewards", finite=False) if "rewards" in group else None
+            if SOURCE_REWARD in arrays.group:
+                return arrays.read(SOURCE_REWARD, n_more=1, finite=False)[1:]
+            return arrays.read("rewards", finite=False) if "rewards" in arrays.group else None
 
         return self._each(read)
 
@@ -200,18 +199,18 @@ class Dataset:
         """
         widths: list[object] = []
 
-        def digest(group: h5py.Group) -> str:
-            observed = self._observed(group)
+        def digest(arrays: EpisodeArrays) -> str:
+            observed = arrays.observed()
             numeric = {path: entry for path, entry in observed.items() if is_numbers(entry)}
-            arrays = [self._array(group, "actions", ndim=None), np.array([self._is_terminated(group)])]
-            widths.append({"actions": arrays[0].shape[1:], **{path: numeric[path].shape[1:] for path in numeric}})
-            if _QPOS in group:
-                arrays.append(read_array(group[_QPOS], np.float64))
+            rest = [arrays.read("actions", ndim=None), np.array([arrays.is_terminated()])]
+            widths.append({"actions": rest[0].shape[1:], **{path: numeric[path].shape[1:] for path in numeric}})
+            if _QPOS in arrays.group:
+                rest.append(read_array(arrays.group[_QPOS], np.float64))
             parts = (
                 [check_finite(path, read_array(entry, np.float32))] if path in numeric else stored_rows(entry)
                 for path, entry in observed.items()
             )
-            return artifacts.hash_stream(itertools.chain(*parts, arrays))
+            return artifacts.hash_stream(itertools.chain(*parts, rest))
 
         digests = self._each(digest)
         self._check_alike(widths)
@@ -259,13 +258,13 @@ class Dataset:
             )
         return self.record.task
 
-    def _each(self, read: Callable[[h5py.Group], Any]) -> list[Any]:
+    def _each(self, read: Callable[[EpisodeArrays], Any]) -> list[Any]:
         results = []
         for name, group in self.groups.items():
             what = f"{name} of dataset {self.id}"
             with mapped_errors(what):
                 try:
-                    results.append(read(group))
+                    results.append(read(EpisodeArrays(group, self.lengths[name])))
                 except BadInput as error:
                     raise BadInput(f"{what}: {error}") from error
         return results
@@ -279,60 +278,6 @@ class Dataset:
                     f"and {width} in {name}; repair or drop it. Where floats may be pictures or numbers, declare "
                     "bounds in the observation space: pictures are in [0, 1]"
                 )
-
-    def _member(self, group: h5py.Group, name: str) -> Any:
-        if name not in group:
-            raise BadInput(
-                f"dataset {self.id} has no {name!r} in {group.name}; record it when the dataset is made "
-                "(zest_rl.data.reader describes the layout)"
-            )
-        return group[name]
-
-    def _array(
-        self,
-        group: h5py.Group,
-        name: str,
-        dtype: type = np.float32,
-        *,
-        n_more: int = 0,
-        ndim: int | None = 1,
-        finite: bool = True,
-    ) -> NDArray[Any]:
-        """Read an array of T + `n_more` rows of numbers, of any number of dimensions if `ndim` is None."""
-        node = self._member(group, name)
-        if not isinstance(node, h5py.Dataset):
-            raise BadInput(f"{name!r} in {group.name} of dataset {self.id} must be one flat array, got a group")
-        self._check_rows(name, node, n_more)
-        if ndim is not None and node.ndim != ndim:
-            raise BadInput(f"{name} must have {ndim} dimensions, got shape {node.shape}; repair or drop the episode")
-        values = read_array(node, dtype)
-        return check_finite(name, values) if finite else values
-
-    def _check_rows(self, name: str, node: h5py.Dataset, n_more: int) -> None:
-        check_rows(name, node, self.lengths[node.name.split("/")[1]], n_more)
-
-    def _is_terminated(self, group: h5py.Group) -> bool:
-        return bool(self._array(group, "terminations")[-1])
-
-    def _observed(self, group: h5py.Group) -> dict[str, h5py.Dataset]:
-        """Return the entries of the observations by their paths, of T + 1 rows each, before they are read."""
-        observed = entries(self._member(group, "observations"), "observations")
-        for path, entry in observed.items():
-            self._check_rows(path, entry, 1)
-        return observed
-
-    def _observations(self, group: h5py.Group) -> FloatArray:
-        self._observed(group)
-        return numbers(group["observations"])
-
-    def _actions(self, group: h5py.Group, discrete: bool) -> FloatArray:
-        actions = self._array(group, "actions", ndim=None)
-        is_discrete = acts_discretely(group)
-        if is_discrete and not discrete:
-            raise BadInput("its actions are discrete, a policy here acts by continuous ones; `zest export` takes them")
-        return (
-            actions.reshape(len(actions), math.prod(actions.shape[1:])) if actions.ndim > 1 or is_discrete else actions
-        )
 
 
 @contextmanager
