@@ -90,7 +90,7 @@ def test_a_manifest_lists_both_files(change: Callable[[dict[str, str]], Any], co
         ('"x"', "must"),
         ("[" * 100_000, "cannot be read as JSON"),
         ('{"a": 1' + "0" * 5000 + "}", "cannot be read as JSON"),
-        ("", "cannot be read as JSON"),
+        ("", "is empty"),
     ],
     ids=["list", "text", "deep", "great", "empty"],
 )

@@ -169,9 +169,10 @@ class DatasetRecord:
             BadInput: the record of a stage is not in our format.
         """
         try:
-            stages: dict[str, Mapping[str, Any]] = {
-                stage: dict(record) for stage, record in metadata.get("zest", {}).items()
-            }
+            stages = metadata.get("zest", {})
+            for stage, record in stages.items():
+                if not isinstance(record, Mapping):
+                    raise TypeError(f"{stage} must be an object, got {record!r:.80}")
             collect, relabel = stages.get("collect"), stages.get("relabel")
             made = {
                 "id": dataset_id,
