@@ -12,7 +12,7 @@ from zest_rl.data.images import read_image
 from zest_rl.embedders import load_embedder
 from zest_rl.errors import BadInput, Notice
 from zest_rl.kitchen.tasks import TASKS, Task
-from zest_rl.rewards.goals import VISUAL_TASKS_VARIABLE, GoalSpec, embed_goal, read_folder, read_goal
+from zest_rl.rewards.goals import VISUAL_TASKS_VARIABLE, GoalSpec, embed_goal, read_folder, read_free_goal, read_goal
 
 MICRO = TASKS["micro"]
 DRAWINGS = Path(__file__).parents[2] / "datasets" / "goals" / "micro"
@@ -222,3 +222,11 @@ def test_pictures_are_embedded_one_row_each_and_in_their_order(folder: Path) -> 
 def test_sentences_for_an_embedder_of_pictures_are_refused_and_one_that_reads_them_is_named() -> None:
     with pytest.raises(BadInput, match=r"reads images only; for sentences use one like open_clip:ViT-B-32/openai"):
         embed_goal(read_goal("text:closed microwave -> open microwave", MICRO), load_embedder("efficientnet-lite0"))
+
+
+@pytest.mark.parametrize("spec", ["~nobody-here/goals", "a sentence without its mark " * 300])
+def test_what_names_no_folder_is_an_unknown_goal(spec: str) -> None:
+    with pytest.raises(BadInput, match="unknown goal"):
+        read_goal(spec, MICRO)
+    with pytest.raises(BadInput, match="need a goal of their own"):
+        read_free_goal(spec)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from zest_rl.errors import BadInput
-from zest_rl.runtime.files import check_file, file_under
+from zest_rl.runtime.files import check_file, file_under, is_there, user_path
 
 POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:" + "a" * 64 + "\nsize 123456\n"
 
@@ -40,6 +40,14 @@ def test_a_file_that_may_not_be_read_is_told_as_such(tmp_path: Path) -> None:
     (tmp_path / "secret").chmod(0)
     with pytest.raises(BadInput, match="secret may not be read; change its permissions"):
         check_file(tmp_path / "secret")
+
+
+def test_the_home_folder_of_nobody_is_a_name_like_any_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert user_path("~/goals") == tmp_path / "goals"
+    assert user_path("~nobody-here/goals") == Path("~nobody-here/goals")
+    assert not any(map(is_there, (Path("x" * 9999), Path("\0"), tmp_path / "none")))
+    assert is_there(tmp_path)
 
 
 def test_a_name_in_data_cannot_leave_the_folder_of_the_data(tmp_path: Path) -> None:

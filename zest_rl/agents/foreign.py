@@ -37,6 +37,7 @@ from zest_rl.agents.base import check_obs
 from zest_rl.agents.child import PolicyProcess
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime.artifacts import hash_file
+from zest_rl.runtime.files import user_path
 from zest_rl.runtime.records import from_json
 from zest_rl.runtime.trust import check_trusted
 from zest_rl.types import FloatArray
@@ -132,7 +133,7 @@ def identify(spec: str, python: str | None = None) -> PolicyIdentity:
         words = (_absolute(rest),)
         version = entry.dist.version if entry.dist is not None else "unknown"
         return PolicyIdentity(family, words, _hash_files(words), code=f"{entry.value} {version}")
-    path = Path(rest).expanduser()
+    path = user_path(rest)
     if not path.is_file():
         raise BadInput(f"there is no file {path}; give what the training program saved")
     weights = path.with_name(f"{path.name}.data")  # where torch's exporter puts external weights
@@ -155,7 +156,7 @@ def _split_path(word: str) -> tuple[str, Path | None]:
     """Split ``--flag=PATH`` into ``--flag=`` and the absolute path; None when the word names no file or folder."""
     flag, equals, value = word.rpartition("=") if word.startswith("-") else ("", "", word)
     try:
-        path = Path(value).expanduser()
+        path = user_path(value)
         is_path = path.is_file() or (path.is_dir() and "/" in value)  # a plain word may be a sub-command
         return flag + equals, path.absolute() if is_path else None  # not resolved: a venv's python is a link
     except (OSError, RuntimeError):  # a name that is too long, or the home of an unknown user
@@ -192,7 +193,7 @@ def _split(command: str) -> list[str]:
 
 
 def _find_program(python: str) -> str:
-    program = shutil.which(Path(python).expanduser())
+    program = shutil.which(user_path(python))
     if program is None:
         raise BadInput(f"there is no program {python!r}; give --python /path/to/bin/python, which has d3rlpy")
     return str(Path(program).absolute())

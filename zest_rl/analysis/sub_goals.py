@@ -28,6 +28,7 @@ from zest_rl.rewards.goals import SAME_SCENE, TEXT, GoalSpec, embed_goal, read_f
 from zest_rl.rewards.scorer import ScorerConfig
 from zest_rl.rewards.scores import Features, Similarity, score_views
 from zest_rl.rewards.state_scorer import StateScorer
+from zest_rl.runtime.files import user_path
 from zest_rl.types import FloatArray, Frame
 
 
@@ -127,7 +128,7 @@ def read_sub_goal(spec: str, first: Frame) -> GoalSpec:
     Raises:
         BadInput: `spec` is none of the three, or cannot be read.
     """
-    path = Path(spec).expanduser()
+    path = user_path(spec)
     if spec.startswith(TEXT):
         return read_text(spec)
     if path.is_file():

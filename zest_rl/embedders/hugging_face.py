@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,6 +11,7 @@ from PIL import Image
 from zest_rl.embedders import checkpoints
 from zest_rl.embedders.base import Network
 from zest_rl.errors import BadInput
+from zest_rl.runtime.files import user_path
 
 
 @dataclass(frozen=True, repr=False)
@@ -44,7 +44,7 @@ def build(uri: str, source: str) -> Network:
     """
     from transformers import AutoImageProcessor, AutoModel, AutoTokenizer
 
-    folder = Path(source).expanduser()
+    folder = user_path(source)
 
     def load() -> tuple[Any, dict[str, Any], Any]:
         name = str(folder) if folder.is_dir() else source

@@ -24,6 +24,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from zest_rl.embedders import checkpoints, hugging_face
 from zest_rl.embedders.base import ENTRY_POINTS, Network, Preprocess
 from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.runtime.files import user_path
 
 __all__ = ["Network", "build", "build_lite0"]
 
@@ -39,7 +40,7 @@ def build(uri: str) -> Network:
     """
     family, _, rest = uri.partition(":")
     if family == "moco":
-        return _build_moco(Path(rest).expanduser())
+        return _build_moco(user_path(rest))
     if family == "transformers":
         return hugging_face.build(uri, rest)
     builders = {"open_clip": _build_open_clip, "torchvision": _build_torchvision, "timm": _build_timm}
@@ -51,7 +52,7 @@ def build(uri: str) -> Network:
         raise BadInput(f"unknown embedder {uri!r}; {nearest(family, families)}")
     name, at, file = rest.partition("@")
     model, _, tag = name.partition("/")
-    return builders[family](uri, model, tag, Path(file).expanduser() if at else None)
+    return builders[family](uri, model, tag, user_path(file) if at else None)
 
 
 def _build_registered(uri: str, rest: str, entry: importlib.metadata.EntryPoint) -> Network:

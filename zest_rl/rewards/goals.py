@@ -27,6 +27,7 @@ from zest_rl.errors import BadInput, Notice
 from zest_rl.kitchen.tasks import Task, get_task
 from zest_rl.kitchen.views import Views, scene_pair
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.files import is_there, user_path
 from zest_rl.types import Frame
 
 SAME_SCENE, DRAWINGS, VISUAL_TASKS, TASK_TEXT, TEXT = "same-scene", "drawings", "visual-tasks:", "text", "text:"
@@ -118,8 +119,8 @@ def goal_folder(spec: str, task: Task) -> Path | None:
         return _drawings(task)
     if spec.startswith(VISUAL_TASKS):
         return _visual_tasks(spec, task)
-    folder = Path(spec).expanduser()
-    if not folder.exists():
+    folder = user_path(spec)
+    if not is_there(folder):
         raise BadInput(
             f"unknown goal {spec!r}: it is neither {SAME_SCENE!r}, {DRAWINGS!r}, '{VISUAL_TASKS}real_imgs', "
             "'text', 'text:START -> GOAL', nor an existing folder with init/ and goal/"
@@ -193,8 +194,8 @@ def read_free_goal(spec: str) -> GoalSpec:
     """
     if spec.startswith(TEXT):
         return read_text(spec)
-    folder = Path(spec).expanduser()
-    if spec in (SAME_SCENE, DRAWINGS, TASK_TEXT) or spec.startswith(VISUAL_TASKS) or not folder.exists():
+    folder = user_path(spec)
+    if spec in (SAME_SCENE, DRAWINGS, TASK_TEXT) or spec.startswith(VISUAL_TASKS) or not is_there(folder):
         kitchen = f"{SAME_SCENE!r}, {DRAWINGS!r}, 'text' and '{VISUAL_TASKS}…' are of zest/Kitchen-v1's tasks alone"
         raise BadInput(
             f"frames from elsewhere need a goal of their own, got {spec!r} ({kitchen}); give --goal a folder with "

@@ -10,6 +10,14 @@ from zest_rl.errors import BadInput
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 
 
+def user_path(text: str | Path) -> Path:
+    """Return the path that a user typed; ``~`` and ``~name`` are home folders where these are known."""
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:
+        return Path(text)
+
+
 def check_file(path: Path) -> None:
     """Refuse what no parser should see: no regular file (a pipe, ``/dev/zero``), empty, or a Git LFS pointer.
 

@@ -21,6 +21,7 @@ from zest_rl.data.observations import choose_pictures, joined, rejected
 from zest_rl.data.writer import DatasetCopy, Trajectories
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.views import Views
+from zest_rl.runtime.files import is_there, user_path
 from zest_rl.sources.base import EpisodeFrames, Source
 from zest_rl.sources.kitchen import KitchenStates, read_kitchen
 from zest_rl.sources.pictures import Pictures, picture_entries
@@ -30,12 +31,12 @@ __all__ = ["EpisodeFrames", "KitchenStates", "Source", "open_source"]
 
 
 def _is_path(dataset: str) -> bool:
-    path, is_id = Path(dataset).expanduser(), reader.DATASET_ID.fullmatch(dataset)
-    if not (path.exists() or is_id) and (path.suffix or dataset.startswith(("/", ".", "~"))):
+    path, is_id = user_path(dataset), reader.DATASET_ID.fullmatch(dataset)
+    if not (is_there(path) or is_id) and (path.suffix or dataset.startswith(("/", ".", "~"))):
         raise BadInput(
             f"there is no file or folder {dataset}; give a robomimic HDF5 file, a LeRobot folder or a Minari id"
         )
-    return path.exists() and not (is_id and reader.exists(dataset))
+    return is_there(path) and not (is_id and reader.exists(dataset))
 
 
 def open_source(
@@ -78,9 +79,9 @@ def open_source(
             )
         if frames and cameras:
             raise BadInput("--camera renders recorded states, --frames says where pictures are; give one of them")
-        if skip_incomplete and (ds is not None or not Path(dataset).expanduser().is_dir()):
+        if skip_incomplete and (ds is not None or not user_path(dataset).is_dir()):
             raise BadInput("--skip-incomplete is for LeRobot folders alone; leave it out")
-        folders = [path.resolve() for path in (Path(name).expanduser() for name in frames) if path.is_dir()]
+        folders = [path.resolve() for path in (user_path(name) for name in frames) if is_there(path) and path.is_dir()]
         if folders and len(folders) < len(frames):
             raise BadInput(f"--frames must be folders or entries of the dataset, not both; got {', '.join(frames)}")
         keys = [] if folders else frames
@@ -90,7 +91,7 @@ def open_source(
             if cameras:
                 raise BadInput("--camera renders the states of Minari datasets alone; leave it out")
             trajectories, episode_frames = _open_path(
-                Path(dataset).expanduser(), keys, with_frames=not folders, skip_incomplete=skip_incomplete
+                user_path(dataset), keys, with_frames=not folders, skip_incomplete=skip_incomplete
             )
         else:
             episode_frames = None if folders else _minari_frames(ds, keys, cameras)

@@ -62,7 +62,9 @@ class Info:
         """Raise `BadInput` for another version or format."""
         try:
             info = artifacts.read_json(root / INFO)
-            version = str(info.get("codebase_version"))
+            if not isinstance(info, dict):
+                raise ValueError(f"a list of names and values is needed, got {str(info)[:20]}")
+            version = str(info["codebase_version"])
             if not version.startswith("v3."):
                 raise BadInput(
                     f"{root} is a LeRobot dataset of version {version[:20]}, v3.0 is read; convert it with "
