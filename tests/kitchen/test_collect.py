@@ -134,6 +134,7 @@ def test_the_library_does_what_the_command_does(
     ("words", "rule"),
     [
         (["--n-episodes", "0"], "n-episodes must be at least 1, got 0"),
+        (["--n-episodes", "100000000000000"], "n-episodes must be at most 1000000, got 100000000000000"),
         (["--task", "mirco"], "unknown task 'mirco'; did you mean 'micro'?"),
         (["--noise-max", "3"], "noise_max must be in [0, 2.0]"),
         (["--seed", "-1"], "seed must be 0 or positive, got -1"),

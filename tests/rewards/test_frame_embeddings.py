@@ -1,19 +1,24 @@
 from __future__ import annotations
 
+import random
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
+from fuzzing import damaged_bytes, faults, outcome
 from PIL import Image
 
+from zest_rl.errors import ZestError
 from zest_rl.kitchen.views import Views
 from zest_rl.rewards.frame_embeddings import FrameEmbeddings
 from zest_rl.rewards.state_embeddings import StateEmbedder, StateEmbeddings
+from zest_rl.runtime import artifacts
 from zest_rl.sources import Source, open_source
 from zest_rl.sources.kitchen import KitchenStates, kitchen_source
 from zest_rl.sources.videos import EpisodeVideos
@@ -81,3 +86,60 @@ def test_the_kitchen_embedded_by_distinct_states_is_the_kitchen_embedded_frame_b
     assert by_state.n_embedded < sum(map(len, frames.states)) / 2, "equal states are embedded once"
     for one, other in zip(by_state, by_frame, strict=True):
         np.testing.assert_allclose(one.embeddings[one.index], other.embeddings[other.index], atol=1e-4)
+
+
+# --- damage and other numbers -----------------------------------------------------------------------------------------
+
+
+def embeddings_of(source: Source) -> FrameEmbeddings:
+    return FrameEmbeddings(source, "efficientnet-lite0", device="cpu", n_workers=1)
+
+
+def filled(source: Source, cache: Path) -> tuple[list[np.ndarray], list[Path]]:
+    """Embed all episodes; return their embeddings and the files of the cache."""
+    embeddings = embeddings_of(source)
+    embeddings.embed()
+    return [episode.embeddings for episode in embeddings], sorted(cache.glob("frames/*/*.npz"))
+
+
+@pytest.mark.parametrize("n_inputs", [8, pytest.param(300, marks=pytest.mark.slow)])
+def test_whatever_happens_to_the_files_the_embeddings_are_those_of_the_frames(
+    n_inputs: int, source: Source, tmp_path: Path
+) -> None:
+    expected, files = filled(source, tmp_path / "cache")
+    whole = {path: path.read_bytes() for path in files}
+
+    def read(seed: int) -> str:
+        rng = random.Random(seed)
+        late = embeddings_of(source)
+        damage(rng)
+        late.embed()
+        damage(rng)  # what is read was whole a moment before
+        return artifacts.hash_arrays(*(episode.embeddings for episode in late))
+
+    def damage(rng: random.Random) -> None:
+        for path in files:
+            path.write_bytes(damaged_bytes(whole[path], rng) if rng.random() < 0.5 else whole[path])
+
+    outcomes = [outcome(partial(read, seed)) for seed in range(n_inputs)]
+    kinds, wrong = faults(outcomes)
+    assert not wrong
+    assert kinds == {"read": n_inputs}
+    assert {one.detail for one in outcomes} == {repr(artifacts.hash_arrays(*expected))}
+
+
+def test_whole_files_with_other_numbers_are_refused_and_nothing_is_deleted(source: Source, tmp_path: Path) -> None:
+    _, files = filled(source, tmp_path / "cache")
+    content = [path.read_bytes() for path in files]
+    for path, other in zip(files, content[1:] + content[:1], strict=True):
+        path.write_bytes(other)
+    with pytest.raises(ZestError, match=rf"cache {files[0].parent} are not those .*; delete that folder, then run"):
+        embeddings_of(source).embed()
+    assert [path.read_bytes() for path in files] == content[1:] + content[:1]
+
+
+def test_a_cached_episode_costs_no_more_than_the_frames_that_are_compared(source: Source, tmp_path: Path) -> None:
+    filled(source, tmp_path / "cache")
+    again = embeddings_of(source)
+    again.embed()
+    assert again.n_embedded == 0

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import re
 import shutil
 import signal
@@ -17,6 +18,7 @@ import h5py
 import minari
 import numpy as np
 import pytest
+from fuzzing import damaged_bytes
 from read_dataset import read
 
 from zest_rl.cli import main
@@ -36,6 +38,7 @@ from zest_rl.rewards.relabel import (
 from zest_rl.rewards.scorer import ScorerConfig
 from zest_rl.rewards.state_embeddings import STATES_PER_SHARD
 from zest_rl.rewards.state_scorer import StateScorer
+from zest_rl.runtime.arrays import read_arrays, write_arrays
 from zest_rl.sources.kitchen import kitchen_source
 
 VIEWS = Views("micro", n_views=1, size=96, tolerance=0.05)
@@ -307,6 +310,50 @@ def test_a_run_killed_while_embedding_and_killed_while_writing_ends_as_one_that_
         np.testing.assert_array_equal(array, expected[name])
     names = [sorted(p.name for p in (tmp_path / r / "zest").iterdir()) for r in ("minari", "uninterrupted")]
     assert names[0] == names[1], "nothing of the cut runs is left"
+
+
+# --- damaged caches ---
+
+
+def test_a_damaged_cache_gives_the_same_rewards_without_a_word(
+    relabeled: Relabeled,
+    places: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    shutil.copytree(places, tmp_path / "places")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "places/minari"))
+    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "places/cache"))
+    whole, rng = arrays(relabeled.dataset_id), random.Random(0)
+    for path in sorted((tmp_path / "places/cache").rglob("*.npz")):
+        path.write_bytes(damaged_bytes(path.read_bytes(), rng))
+    shutil.rmtree(reader.dataset_path(relabeled.dataset_id))
+    again = relabel_kitchen(CONFIG, n_workers=1)
+    assert again.dataset_id == relabeled.dataset_id
+    assert again.n_embedded > 0
+    for name, array in arrays(again.dataset_id).items():
+        np.testing.assert_array_equal(array, whole[name])
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("kind", ["embeddings", "goals"])
+def test_a_cache_of_other_numbers_is_refused_before_anything_is_written(
+    kind: str, relabeled: Relabeled, places: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(places, tmp_path / "places")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "places/minari"))
+    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "places/cache"))
+    shutil.rmtree(reader.dataset_path(relabeled.dataset_id))
+    for path in (tmp_path / f"places/cache/{kind}").rglob("*.npz"):
+        stored = read_arrays(path) or {}
+        vectors = {name: array for name, array in stored.items() if name != "keys"}
+        write_arrays(path, stored | {name: array[..., ::-1].copy() for name, array in vectors.items()})
+    with pytest.raises(
+        ZestError, match=rf"embeddings in the cache .*{kind}.* are not those that this machine computes"
+    ):
+        relabel_kitchen(CONFIG, n_workers=1)
+    assert reader.list_datasets() == [SOURCE]
 
 
 # --- no path from the ground truth ---
