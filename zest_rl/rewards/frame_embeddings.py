@@ -128,7 +128,8 @@ class FrameEmbeddings:
         options: dict[str, Any] = {
             "engine": self._engine, "device": self._shared.embedder.device, "stage": "reading and embedding frames",
         }  # fmt: skip
-        cached = [i for i in range(len(self._digests)) if self._read(i) is not None]
+        # the arrays themselves are verified when they are read
+        cached = [i for i in range(len(self._digests)) if read_arrays(self._path(i), {}) is not None]
         self._check(random.sample(cached, min(N_CHECKED, len(cached))), options)
         missing = set(range(len(self._digests))) - set(cached)
         jobs = {self._path(i).stem: _Job(i, self._n_steps[i]) for i in sorted(missing)}
@@ -162,6 +163,7 @@ class FrameEmbeddings:
             if frames is None:
                 arrays = _embed_episode(self._shared, _Job(i, n_steps))
                 write_arrays(self._path(i), arrays)
+                self.n_embedded += 1
                 frames = arrays["embeddings"]
             if len(frames) not in (n_steps, n_steps + 1):
                 raise BadInput(f"episode {i} has {n_steps} actions and {len(frames)} frames")

@@ -31,7 +31,7 @@ def read_arrays(
 
     Args:
         path: the file.
-        layout: the arrays to read; None: all, as they are.
+        layout: the arrays to read; None: all, as they are. Empty: only look whether a file with digests is there.
         undigested: accept files of versions that wrote no digests; nothing but zip's checksum guards them.
     """
     try:
