@@ -338,7 +338,7 @@ def test_an_unreachable_hub_is_told_quickly_with_the_offline_ways(
     with pytest.raises(ZestError, match=f"{uri}@/path/to/checkpoint, or use efficientnet-lite0") as caught:
         load_embedder(uri)
     assert not isinstance(caught.value, BadInput)
-    assert time.monotonic() - start < 10
+    assert time.monotonic() - start < 60, "it would try again for minutes"
     assert setting == constants.HF_HUB_OFFLINE
 
 

@@ -214,8 +214,9 @@ def _layout(job: _Job) -> Layout:
 def remove_parts(behaviour: Behaviour) -> None:
     """Remove what `run_behaviour` kept, once no other command reads it."""
     folder = behaviour_folder(behaviour)
-    with artifacts.lock(folder):
-        shutil.rmtree(folder, ignore_errors=True)
+    if folder.exists():
+        with artifacts.lock(folder):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def behaviour_folder(behaviour: Behaviour) -> Path:

@@ -63,7 +63,10 @@ def collect_dataset(
             if not reader.exists(config.dataset_id):
                 result = _collect(config, asked, path, n_workers, on_progress, on_result)
                 return Collected(config.dataset_id, path, result, already_there=False)
-    return Collected(config.dataset_id, path, _collected_before(config, asked, path), already_there=True)
+    before = _collected_before(config, asked, path)
+    flaws = {name: before[name] for name in LARGEST}
+    remove_parts(Behaviour(config.task, "expert", seed=config.seed, **flaws))  # which a kill at the very end may leave
+    return Collected(config.dataset_id, path, before, already_there=True)
 
 
 def _collect(
