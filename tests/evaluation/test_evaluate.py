@@ -317,6 +317,8 @@ def test_weights_that_were_changed_are_refused(trained: Path) -> None:
         ({"id": "CartPole-v1", "entry_point": "gymnasium.envs:CartPole"}, "steps, got CartPole-v1"),
         ({"entry_point": "zest_rl.cli:main"}, f"{ENV_ID} would run code of 'zest_rl.cli:main', but is registered as"),
         ({"max_episode_steps": None}, "with max_episode_steps None"),
+        ({"max_episode_steps": 10**12}, "with max_episode_steps 1000000000000"),
+        ({"unheard_of": 1}, "the environment of the run is not the JSON of a Gymnasium EnvSpec"),
     ],
 )
 def test_a_run_from_elsewhere_cannot_bring_an_environment_of_its_own(

@@ -142,7 +142,7 @@ def few_weights(n_layers: int, weights_per_layer: int) -> Rule:
     """Return the rule of a number of equal layers."""
     return (
         1 <= n_layers <= MOST_LAYERS and n_layers * weights_per_layer <= MOST_WEIGHTS,
-        f"1 to {MOST_LAYERS}, and give at most {MOST_WEIGHTS:.0e} weights",
+        f"1 to {MOST_LAYERS}, and few enough for {MOST_WEIGHTS:,} weights in all",
     )
 
 

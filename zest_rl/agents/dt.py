@@ -50,6 +50,8 @@ from zest_rl.types import Episode, FloatArray
 
 
 Timesteps = Literal["absolute", "relative"]
+LONGEST_CONTEXT = 2048
+"""Steps; the mask of each block grows with their square."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ class DTConfig(OptimizerConfig):
 
     def __post_init__(self) -> None:
         check_fields("DT config", self, {
-            "context_len": whole(self.context_len, 2048),
+            "context_len": whole(self.context_len, LONGEST_CONTEXT),
             "hidden_size": whole(self.hidden_size, LARGEST_WIDTH),
             "n_layers": few_weights(self.n_layers, 12 * self.hidden_size**2),
             "n_heads": (
@@ -84,7 +86,7 @@ class DTConfig(OptimizerConfig):
             ),
             "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
             "timesteps": (self.timesteps in get_args(Timesteps), f"one of {', '.join(get_args(Timesteps))}"),
-            "batch_size": whole(self.batch_size, max(1, LARGEST_BATCH // max(1, self.context_len))),
+            "batch_size": whole(self.batch_size, LARGEST_BATCH // min(max(1, self.context_len), LONGEST_CONTEXT)),
             **self.optimizer_rules(),
         })  # fmt: skip
 

@@ -103,7 +103,10 @@ def _record(policy: Policy) -> DatasetRecord:
 def _kitchen_spec(env_spec: str) -> gymnasium.envs.registration.EnvSpec:
     """Read the EnvSpec of a run, which may come from somebody else and must not choose what code is run."""
     check_env_spec(env_spec, "the environment of the run", "evaluate a run on a dataset of the kitchen")
-    spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
+    try:
+        spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise BadInput(f"the environment of the run is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
     horizon = spec.max_episode_steps
     if spec.id != ENV_ID or type(horizon) is not int or not 1 <= horizon <= MAX_HORIZON:
         raise BadInput(

@@ -87,7 +87,8 @@ class Scorer:
             BadInput: the goal is a sentence and the embedder reads pictures only.
         """
         embedder = shared_embedder(config.embedder, config.precision, device)
-        remember("embedder", config.embedder)
+        if config.embedder != DEFAULT_EMBEDDER:
+            remember("embedder", config.embedder)
         starts, goals = embed_goal_cached(goal, embedder)
         return cls(config, starts, goals, goal.fingerprint(), embedder.fingerprint, views, goal)
 
