@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import tokenizers
 import torch
 import transformers
+from fuzzing import damaged_json, faults, outcomes
 from PIL import Image
 from safetensors.torch import load_file, save_file
 
@@ -141,3 +143,28 @@ def test_transformers_weights_that_are_not_all_there_are_refused(tmp_path: Path)
     (tmp_path / "config.json").unlink()
     with pytest.raises(BadInput, match=r"config\.json does not exist"):
         load_embedder(f"transformers:{tmp_path}")
+
+
+@pytest.mark.parametrize("change", [{"hidden_size": 10**9}, {"num_hidden_layers": 10**7}])
+def test_a_config_of_absurd_size_is_refused_before_the_model_is_built(change: dict[str, int], tmp_path: Path) -> None:
+    save_hugging_face("clip", tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    config["vision_config"] |= change
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    ((name, size),) = change.items()
+    with pytest.raises(BadInput, match=rf"config.json cannot be read .*{name} = {size}"):
+        load_embedder(f"transformers:{tmp_path}")
+
+
+def test_a_damaged_config_is_read_or_refused(tmp_path: Path) -> None:
+    save_hugging_face("clip", tmp_path)
+    whole, rng = json.loads((tmp_path / "config.json").read_text()), random.Random(0)
+    damaged = [json.dumps(damaged_json(whole, rng)) for _ in range(20)]
+
+    def read(i: int) -> int:
+        (tmp_path / "config.json").write_text(damaged[i])
+        return load_embedder(f"transformers:{tmp_path}").dim
+
+    counts, bad = faults(outcomes(read, len(damaged)))
+    print("config.json", len(damaged), dict(counts))
+    assert not bad, bad[0].detail

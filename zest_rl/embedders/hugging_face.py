@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,9 @@ from zest_rl.embedders import checkpoints
 from zest_rl.embedders.base import Network
 from zest_rl.errors import BadInput
 from zest_rl.runtime.files import user_path
+
+MOST_LAYERS, LARGEST_SIZE = 1000, 10**7
+"""Of a model's config; the largest size of one is its vocabulary."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -55,6 +59,7 @@ def build(uri: str, source: str) -> Network:
 
     if folder.is_dir():
         with checkpoints.reading(folder / "config.json"):
+            _check_sizes(json.loads((folder / "config.json").read_text(encoding="utf-8")))
             module, info, processor = load()
     elif source.startswith(("/", "~", ".")):
         raise BadInput(f"{source} is not a folder; give one that save_pretrained left, or a name on the hub")
@@ -98,6 +103,15 @@ def build(uri: str, source: str) -> Network:
         return _vector(module.get_text_features(**tokens.to(module.device)))
 
     return Network(module, _Preprocess(processor), encode_images, encode_texts)
+
+
+def _check_sizes(config: Any, name: str = "") -> None:
+    """Refuse sizes that no published model has, before the model is built; its weights are read afterwards."""
+    if isinstance(config, dict | list):
+        for key, value in config.items() if isinstance(config, dict) else ((name, item) for item in config):
+            _check_sizes(value, str(key))
+    elif isinstance(config, int | float) and config > (MOST_LAYERS if "layers" in name else LARGEST_SIZE):
+        raise ValueError(f"{name} = {config}")
 
 
 def _vector(output: Any) -> torch.Tensor:

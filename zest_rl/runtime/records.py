@@ -53,7 +53,9 @@ def from_json(record: type[T], values: Mapping[str, Any]) -> T:
         allowed = tuple(kind for option in options for kind in _KINDS[option])
         if type(value) not in allowed:
             raise TypeError(f"{field.name} must be {field.type}, got {str(value)[:40]!r}")
-        numbers = value if isinstance(value, list | tuple) else [value] if isinstance(value, float) else []
+        numbers = (
+            value if isinstance(value, list | tuple) else [value] if "float" in options and value is not None else []
+        )
         if not all(type(number) in (float, int) and math.isfinite(number) for number in numbers):
             raise ValueError(f"{field.name} must be finite, got {str(value)[:40]}")
         if isinstance(value, list):
