@@ -226,8 +226,7 @@ def collecting(depth: int) -> Scenario:
 
     calibration.N_REFERENCE, calibration.N_NOTHING, behaviour.EPISODES_PER_JOB, behaviour.HORIZON = 1, 1, 1, 50
     config = CollectConfig(task="micro", n_episodes=2, noise_max=0.5)
-    context = multiprocessing.get_context("fork")  # a spawned child would import everything again
-    multiprocessing.get_context = lambda method=None: context  # type: ignore[assignment]
+    fork_children()
 
     def places(folder: Path) -> None:
         os.environ.update(MINARI_DATASETS_PATH=str(folder / "minari"), ZEST_CACHE=str(folder / "cache"))
@@ -242,6 +241,65 @@ def collecting(depth: int) -> Scenario:
             return ds.fingerprint(), Dataset.describe(ds)
 
     return Scenario(work, result, depth=depth)
+
+
+def pictures(folder: Path) -> None:
+    """Leave two episodes of one action in robomimic's layout, pictures of their frames, and a goal."""
+    import h5py
+    import numpy as np
+    from PIL import Image
+
+    rng = np.random.default_rng(0)
+    names = [f"films/episode_{i}/{t}.png" for i in range(2) for t in range(2)] + ["goal/init/0.png", "goal/goal/0.png"]
+    for path in (folder / name for name in names):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(rng.integers(0, 256, (16, 16, 3), dtype=np.uint8)).save(path)
+    with h5py.File(folder / "some.hdf5", "w") as file:
+        for i in range(2):
+            file[f"data/demo_{i}/actions"], file[f"data/demo_{i}/obs/joints"] = np.zeros((1, 2)), np.zeros((1, 3))
+
+
+def fork_children() -> None:
+    """Fork child processes, because a spawned one would import everything again."""
+    context = multiprocessing.get_context("fork")
+    multiprocessing.get_context = lambda method=None: context  # type: ignore[assignment]
+
+
+def relabeling(root: Path, depth: int) -> Scenario:
+    from zest_rl.data import reader
+    from zest_rl.rewards.relabel import relabel
+
+    data = root / "data"
+    pictures(data)
+    fork_children()
+
+    def places(folder: Path) -> None:
+        os.environ.update(MINARI_DATASETS_PATH=str(folder / "minari"), ZEST_CACHE=str(folder / "cache"))
+
+    def work(folder: Path) -> None:
+        places(folder)
+        relabel(str(data / "some.hdf5"), str(data / "goal"), frames=[str(data / "films")], n_workers=1, device="cpu")
+
+    def result(folder: Path) -> Any:
+        places(folder)
+        (name,) = reader.list_datasets()
+        with reader.open_dataset(name) as ds:
+            return name, ds.fingerprint(), [rewards.tolist() for rewards in ds.rewards()]
+
+    return Scenario(work, result, depth=depth)
+
+
+def exporting(root: Path, to: Any, depth: int) -> Scenario:
+    from zest_rl.export import export
+
+    dataset = small_dataset(root)
+    fork_children()
+
+    def work(folder: Path) -> None:
+        if not (folder / "out").exists():
+            export(dataset, to, folder / "out")
+
+    return Scenario(work, lambda folder: hashes(folder, "out/**/*.memmap"), depth=depth)
 
 
 def main(scenario: str, folder: Path, stride: int) -> dict[str, Any]:
@@ -259,6 +317,11 @@ def main(scenario: str, folder: Path, stride: int) -> dict[str, Any]:
     if kind == "torchrun":
         agent, rank = detail.split()
         return sweep(training(agent, n_processes=2), folder, stride, int(rank))
+    if kind == "relabel":
+        return sweep(relabeling(folder, int(detail)), folder, stride)
+    if kind == "export":
+        to, depth_of_kill = detail.split()
+        return sweep(exporting(folder, to, int(depth_of_kill)), folder, stride)
     if kind == "collect":
         return sweep(collecting(int(detail)), folder, stride)
     return sweep({"evaluate": evaluation, "adopt": adoption}[kind](folder), folder, stride)
