@@ -45,6 +45,10 @@ REACH_OUT: dict[str, tuple[Spoil, str]] = {
         r"x is stored outside the file \(external storage or a virtual dataset\)",
     ),
     "virtual dataset": (lambda file, at: virtual(file, f"{at}/x"), "x is stored outside the file"),
+    "a name that is no text": (
+        lambda file, at: h5py.h5g.create(file.id, at.encode() + b"/demo_\xff") and None,
+        r"/demo_\\xff is a name that is not UTF-8; rename it",
+    ),
     "deep groups": (put("/x" * (MAX_DEPTH + 2))(lambda file: np.zeros(3)), "groups deep, expected 32 at most"),
 }
 

@@ -133,6 +133,8 @@ def _second_name(file: h5py.File) -> str | None:
             return f"{_text(name)} is {_LINKS.get(link.type, 'a link of an unknown kind')}, not data; {_REPACK}"
         if link.u in seen:
             return f"{_text(name)} is a second name of something else in the file; {_REPACK}"
+        if name.decode(errors="ignore").encode() != name:
+            return f"{_text(name)} is a name that is not UTF-8; rename it"
         if name.count(b"/") > MAX_DEPTH:
             return f"{_text(name)} lies {name.count(b'/')} groups deep, expected {MAX_DEPTH} at most"
         seen.add(link.u)
