@@ -109,6 +109,17 @@ def test_the_processes_of_torchrun_end_with_it(by: signal.Signals, collected: st
     assert command.all_end(), command.alive()
 
 
+@pytest.mark.slow
+def test_the_processes_of_ray_end_with_an_interrupted_command(collected: str) -> None:
+    words = ["relabel", collected, "--views", "2", "--tolerance", "0.001", "--engine", "ray", "--n-workers", "2"]
+    command = Command(*ZEST, *words)
+    command.wait_until(lambda: any("_Worker" in line for line in command.alive()))
+    command.process.send_signal(signal.SIGTERM)
+    _, err = command.process.communicate()
+    assert (command.process.returncode, err.endswith(SAID)) == (143, True)
+    assert command.all_end(), command.alive()
+
+
 # --- nobody reads -----------------------------------------------------------------------------------------------------
 
 

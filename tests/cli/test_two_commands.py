@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -47,3 +48,16 @@ def test_the_second_command_waits_says_so_and_does_not_do_the_work_again(
         assert (second.returncode, "out.npz exists; delete it, or choose another" in said_last) == (2, True)
     else:
         assert second.returncode == 0, said_last
+
+
+def test_a_reproduction_waits_for_another_of_the_same_folder_and_can_be_interrupted_meanwhile(tmp_path: Path) -> None:
+    recipe = artifacts.shipped("eval") / "demo.toml"
+    words = ["reproduce", str(recipe), "--output", str(tmp_path / "demo")]
+    with artifacts.lock(tmp_path / "demo"):
+        second = subprocess.Popen([sys.executable, "-c", CODE, *words], stderr=subprocess.PIPE, text=True)
+        assert second.stderr is not None
+        assert f"waiting for {tmp_path}/.demo.lock" in second.stderr.readline()
+        second.send_signal(signal.SIGINT)
+        assert second.stderr.read() == "interrupted; run the same command again to go on\n"
+    assert second.wait() == 130
+    assert not (tmp_path / "demo").exists()
