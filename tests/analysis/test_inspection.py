@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +129,17 @@ def test_constant_scores_and_constant_returns_are_warned_of() -> None:
     assert reward_warnings([np.float32(0.999) + np.float32(8e-4) * score for score in SCORES], figures) == []
     alike = [np.array([0.0, 1.0], np.float32), np.array([1.0, 0.0], np.float32)]
     assert "same return" in reward_warnings(alike, figures)[0]
+
+
+@pytest.mark.parametrize("views", [{"task": 7}, {"colour": 1}, {"size": "224"}, {"n_views": 1.5}])
+def test_views_that_are_not_ours_are_refused(views: dict[str, Any], scored: str) -> None:
+    folder = reader.dataset_path(scored)
+    metadata = json.loads((folder / reader.METADATA_FILE).read_text())
+    metadata["zest"]["relabel"]["scorer"]["config"]["views"] |= views
+    (folder / reader.METADATA_FILE).write_text(json.dumps(metadata))
+    (folder / reader.MANIFEST_FILE).unlink()
+    with pytest.raises(BadInput, match=r"not as this package writes it|was made is not ours"):
+        inspect(scored)
 
 
 def test_differences_are_judged_as_the_trainer_sees_them(collected: str, scored: str) -> None:

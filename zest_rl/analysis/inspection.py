@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.analysis.reward_figures import measure_rewards, reward_warnings, true_returns
+from zest_rl.data.folders import METADATA_FILE
 from zest_rl.data.provenance import RelabelRecord
 from zest_rl.data.reader import open_dataset
 from zest_rl.errors import BadInput
@@ -18,6 +19,7 @@ from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.metrics.reward_quality import returns_of
 from zest_rl.metrics.statistics import MIN_EPISODES_TO_RANK, Estimate
 from zest_rl.runtime.privacy import masked
+from zest_rl.runtime.records import from_json, reading_record
 from zest_rl.types import FloatArray, GroundTruth
 
 
@@ -66,7 +68,8 @@ def inspect(dataset_id: str) -> Inspection:
             raise BadInput(
                 f"rewards can be judged on at least {MIN_EPISODES_TO_RANK} episodes, {dataset_id} has {len(rewards)}"
             )
-        views = None if record.scorer.views is None else Views(**record.scorer.views)
+        with reading_record(ds.path / METADATA_FILE, "relabel the dataset again"):
+            views = None if record.scorer.views is None else from_json(Views, record.scorer.views)
         states = None if views is None else ds.states()
         truth = ds.truth() if ds.has_truth else None
     frames, still = None, None
