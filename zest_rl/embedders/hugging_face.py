@@ -83,6 +83,7 @@ def build(uri: str, source: str) -> Network:
     if not hasattr(module, "get_text_features"):
         return Network(module, _Preprocess(processor), encode_images)
     tokenizer = None
+    siglip = module.config.model_type.startswith("siglip")  # which was trained on padded sentences in lower case
 
     def encode_texts(sentences: list[str]) -> torch.Tensor:
         nonlocal tokenizer
@@ -94,7 +95,6 @@ def build(uri: str, source: str) -> Network:
                 tokenizer = checkpoints.fetch(
                     uri, lambda: AutoTokenizer.from_pretrained(source, trust_remote_code=False)
                 )
-        siglip = module.config.model_type.startswith("siglip")  # which was trained on padded sentences in lower case
         sentences = [sentence.lower() for sentence in sentences] if siglip else sentences
         length = module.config.text_config.max_position_embeddings
         tokens = tokenizer(
@@ -102,7 +102,7 @@ def build(uri: str, source: str) -> Network:
         )
         return _vector(module.get_text_features(**tokens.to(module.device)))
 
-    return Network(module, _Preprocess(processor), encode_images, encode_texts)
+    return Network(module, _Preprocess(processor), encode_images, encode_texts, "lower case" if siglip else "")
 
 
 def _check_sizes(config: Any, name: str = "") -> None:
