@@ -18,7 +18,7 @@ from zest_rl.analysis.clip_selection import GOAL_SHARE, clip_pool, things_with
 from zest_rl.analysis.clips import LABELS, OPENING, VIDEOS, Clip, embed_clips, folder_of_clips, something_something
 from zest_rl.data.video import read_frames
 from zest_rl.embedders import load_embedder
-from zest_rl.errors import BadInput
+from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen.env import KitchenEnv
 from zest_rl.kitchen.tasks import TASKS
 from zest_rl.kitchen.views import Views
@@ -115,11 +115,29 @@ def test_clips_are_embedded_once(root: Path) -> None:
     assert len(done) == 2
     copies = [Clip(clip.path.rename(root / VIDEOS / f"moved-{clip.path.name}"), "oven") for clip in clips]
 
-    class Refusing:
-        fingerprint = embedder.fingerprint
+    n_embedded = []
 
-    again = embed_clips(copies, Refusing(), 4)  # type: ignore[arg-type]  # it fails when it is asked to embed
+    class Counting:
+        fingerprint, dim = embedder.fingerprint, embedder.dim
+
+        def embed_images(self, frames: Any) -> Any:
+            n_embedded.append(len(frames))
+            return embedder.embed_images(frames)
+
+    again = embed_clips(copies, Counting(), 4)  # type: ignore[arg-type]
     np.testing.assert_array_equal(again, first)
+    assert n_embedded == [1], "to compare"
+
+
+def test_a_cache_with_the_embeddings_of_other_clips_is_refused(root: Path, tmp_path: Path) -> None:
+    clips, embedder = something_something(root)[:2], load_embedder("efficientnet-lite0")
+    embed_clips(clips, embedder, 4)
+    one, other = (tmp_path / "cache/clips").glob("*.npz")
+    one.replace(tmp_path / "kept")
+    other.rename(one)
+    (tmp_path / "kept").rename(other)
+    with pytest.raises(ZestError, match="clips are not those that this machine computes"):
+        embed_clips(clips, embedder, 4)
 
 
 def test_candidates_are_the_frames_of_the_other_clips() -> None:
