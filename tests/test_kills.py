@@ -12,8 +12,7 @@ import pytest
 PROGRAM = Path(__file__).with_name("kills.py")
 QUICK = {"train dt": 40, "export torchrl 1": 6}
 SLOW = {
-    **dict.fromkeys(("train bc", "train dt", "torchrun dt 0", "torchrun dt 1"), 1),
-    **{"torchrun bc 0": 4, "torchrun bc 1": 2},
+    **dict.fromkeys(("train bc", "train dt", "torchrun bc 0", "torchrun bc 1", "torchrun dt 0", "torchrun dt 1"), 1),
     **{"evaluate": 1, "adopt": 1, "collect 0": 5, "collect 1": 1, "relabel 0": 2, "relabel 1": 1},
     **dict.fromkeys(("export npz 0", "export torchrl 0", "export torchrl 1"), 1),
 }
