@@ -101,7 +101,7 @@ def test_a_ring_spreads_its_views(n_views: int) -> None:
 
 
 def test_a_ring_without_views_is_refused() -> None:
-    with pytest.raises(BadInput, match="at least 1, got 0"):
+    with pytest.raises(BadInput, match="must be 1 to 1000, got 0"):
         task_cameras(TASKS["micro"], 0)
 
 
@@ -205,7 +205,8 @@ def test_a_renderer_without_cameras_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"), [({"size": 0}, "at least 1 pixel, got 0"), ({"mesh_fraction": 0.0}, r"in \(0, 1\], got 0")]
+    ("change", "message"),
+    [({"size": 0}, "must be 1 to 4096 pixels, got 0"), ({"mesh_fraction": 0.0}, r"in \(0, 1\], got 0")],
 )
 def test_a_config_out_of_range_is_refused(change: dict[str, float], message: str) -> None:
     with pytest.raises(BadInput, match=message):

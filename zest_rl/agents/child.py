@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -33,17 +32,25 @@ TIMEOUT_VARIABLE, TIMEOUT = "ZEST_POLICY_TIMEOUT", 120.0
 GRACE = 5.0
 """Seconds that the process has after the end of stdin before it is killed."""
 MAX_ANSWER = 2**24  # bytes; a longer line is cut and fails to parse
-# A process between us and the command, in whose group are the command and whatever it starts. It kills the group when
-# our end of a pipe is closed, so also when we are killed: a hanging command would not notice that its stdin has ended.
+# A process between us and the command, which with whatever it starts is in a group of its own. The guard kills that
+# group when the command ends, and when our end of a pipe is closed, so also when we are killed: a hanging command would
+# not notice that its stdin has ended.
 _GUARD = """
 import os, signal, subprocess, sys, threading
+command = subprocess.Popen(sys.argv[2:], process_group=0)
+def kill():
+    try:
+        os.killpg(command.pid, signal.SIGKILL)
+    except ProcessLookupError:
+        pass
 def watch():
     os.read(int(sys.argv[1]), 1)
-    os.killpg(0, signal.SIGKILL)
+    kill()
 threading.Thread(target=watch, daemon=True).start()
-command = subprocess.Popen(sys.argv[2:])
 os.close(0)
 os.close(1)
+os.waitid(os.P_PID, command.pid, os.WEXITED | os.WNOWAIT)  # not reaped yet: the group's number is still its own
+kill()
 code = command.wait()
 if code < 0:
     os.kill(os.getpid(), -code)
@@ -69,6 +76,7 @@ class PolicyProcess:
         self._words, self._dims = list(words), {"obs_dim": obs_dim, "act_dim": act_dim}
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: IO[bytes] | None = None
+        self._held: int | None = None
 
     def begin(self, n_episodes: int) -> None:
         """Start the process and tell it how many episodes it plays.
@@ -85,7 +93,7 @@ class PolicyProcess:
             stdout=subprocess.PIPE,
             stderr=self._errors,
             env={**os.environ, **dict.fromkeys(THREAD_VARIABLES, "1")},  # results must not depend on the machine's load
-            start_new_session=True,  # a new process group, which can be killed as a whole
+            start_new_session=True,  # Ctrl-C is for us; we end it
             pass_fds=[watched],
         )
         os.close(watched)
@@ -108,11 +116,16 @@ class PolicyProcess:
             process.stdin.close()
         with suppress(subprocess.TimeoutExpired):
             process.wait(GRACE)
-        _kill(process)
+        self._kill()
         process.wait()
-        os.close(self._held)
         process.stdout.close()
         self._errors.close()
+
+    def _kill(self) -> None:
+        """Let the guard kill the command and whatever it started."""
+        held, self._held = self._held, None
+        if held is not None:
+            os.close(held)
 
     def _ask(self, message: dict[str, Any], key: str) -> Any:
         process = self._process
@@ -123,7 +136,7 @@ class PolicyProcess:
 
         def give_up() -> None:
             timed_out.set()
-            _kill(process)  # ends the wait for its pipes below
+            self._kill()  # ends the wait for its pipes below
 
         timer = threading.Timer(self._timeout, give_up)
         timer.start()
@@ -162,9 +175,3 @@ class PolicyProcess:
         self._errors.seek(max(0, size - 1000))
         text = self._errors.read().decode(errors="replace").strip()
         return f"; its stderr ends with:\n{text}" if text else ""
-
-
-def _kill(process: subprocess.Popen[bytes]) -> None:
-    """Kill the process and its children."""
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(process.pid, signal.SIGKILL)

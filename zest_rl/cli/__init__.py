@@ -30,10 +30,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     with interruptible() as received:
         try:
-            return _main(words, received)
+            code = _main(words, received)
         except BrokenPipeError:
             streams.drop_output()
-            return BROKEN_PIPE
+            code = BROKEN_PIPE
+    if argv is None and "TORCHELASTIC_RUN_ID" in os.environ:
+        os._exit(
+            code
+        )  # of torchrun's processes: gloo's threads may still run, and abort Python where it takes itself down
+    return code
 
 
 def _main(words: list[str], received: Sequence[int]) -> int:
