@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import random
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from fuzzing import damaged_bytes, damaged_json, faults, outcome, outcomes
 
-from zest_rl.agents import load_policy
+from zest_rl.agents import AGENTS, load_policy
+from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import EvaluationConfig, evaluate, read_evaluation
 from zest_rl.report.methods import methods_of_runs
 from zest_rl.rewards.scorer import SCORER_FILE, check_scorer
@@ -26,21 +28,24 @@ COUNTS = [60, pytest.param(1500, marks=pytest.mark.slow)]
 def test_a_damaged_description_of_a_run_is_read_or_refused(run: str, n: int, trained: Path) -> None:
     folder, rng = trained / run, random.Random(0)
     if run == "adopted":
-        meta = artifacts.read_json(trained / "bc-0" / "meta.json")
-        policy = {"family": "command", "words": ["sh", "-c", "x"], "files": {"policy/p": "0" * 64}, "code": ""}
-        (folder / "policy").mkdir(parents=True)
+        meta, file = artifacts.read_json(trained / "bc-0" / "meta.json"), folder / "policy" / "p"
+        artifacts.write_bytes(file, b"x")
+        files = {"policy/p": artifacts.hash_file(file)}
+        policy = {"family": "command", "words": ["sh", "-c", "x"], "files": files, "code": ""}
         artifacts.write_json(folder / "meta.json", meta | {"agent": "foreign", "name": "p", "policy": policy})
     whole = artifacts.read_json(folder / "meta.json")
-    damaged = [json.dumps(damaged_json(whole, rng)).encode() for _ in range(n)]
+    damaged = [json.dumps(value).encode() for value in (whole, *(damaged_json(whole, rng) for _ in range(n)))]
     damaged += [damaged_bytes(json.dumps(whole).encode(), rng) for _ in range(n)]
 
     def read(i: int) -> str:
         (folder / "meta.json").write_bytes(damaged[i])
         methods_of_runs([folder])
-        return load_policy(folder).agent
+        return load_policy(folder, trust=True).agent
 
-    counts, bad = faults(outcomes(read, len(damaged)))
-    print(run, "meta.json", len(damaged), dict(counts))
+    first, *others = outcomes(read, len(damaged))
+    assert first.kind == "read", first.detail
+    counts, bad = faults(others)
+    print(run, "meta.json", len(others), dict(counts))
     assert not bad, bad[0].detail
 
 
@@ -48,14 +53,16 @@ def test_a_damaged_description_of_a_run_is_read_or_refused(run: str, n: int, tra
 def test_damaged_weights_of_a_run_are_refused_even_under_their_own_hash(n: int, trained: Path) -> None:
     folder, rng = trained / "bc-0", random.Random(0)
     whole, meta = (folder / "model.safetensors").read_bytes(), artifacts.read_json(folder / "meta.json")
-    damaged = [damaged_bytes(whole[:4096], rng) + whole[4096:] for _ in range(n)]
+    damaged = [whole, *(damaged_bytes(whole[:4096], rng) + whole[4096:] for _ in range(n))]
 
     def read(i: int) -> str:
         (folder / "model.safetensors").write_bytes(damaged[i])
         artifacts.write_json(folder / "meta.json", meta | {"model_sha256": artifacts.hash_bytes(damaged[i])})
         return load_policy(folder).agent
 
-    counts, bad = faults(outcomes(read, n))
+    first, *others = outcomes(read, n + 1)
+    assert first.kind == "read", first.detail
+    counts, bad = faults(others)
     print("model.safetensors", n, dict(counts))
     assert not bad, bad[0].detail
 
@@ -69,15 +76,17 @@ def test_a_damaged_scorer_is_read_or_refused(n: int, trained: Path) -> None:
     with safe_open(path, "numpy") as file:
         described = json.loads(file.metadata()["scorer"])
     whole, arrays = path.read_bytes(), load_file(path)
-    damaged = [damaged_bytes(whole[:2048], rng) + whole[2048:] for _ in range(n)]
+    damaged = [whole, *(damaged_bytes(whole[:2048], rng) + whole[2048:] for _ in range(n))]
     damaged += [save(arrays, {"scorer": json.dumps(damaged_json(described, rng))}) for _ in range(n)]
 
     def read(i: int) -> None:
         path.write_bytes(damaged[i])
         check_scorer(path)
 
-    counts, bad = faults(outcomes(read, len(damaged)))
-    print("scorer", len(damaged), dict(counts))
+    first, *others = outcomes(read, len(damaged))
+    assert first.kind == "read", first.detail
+    counts, bad = faults(others)
+    print("scorer", len(others), dict(counts))
     assert not bad, bad[0].detail
 
 
@@ -154,3 +163,27 @@ def test_a_run_that_asks_for_absurd_room_is_refused_before_it_is_made(
     assert found.kind == "refused", found.detail
     artifacts.write_json(path, meta | {"max_steps": 10**9})
     assert outcome(lambda: load_policy(trained / run)).kind == ("read" if run == "bc-0" else "refused")
+
+
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [("nonsense", "unknown device 'nonsense'"), ("cuda:77", "torch finds no device 'cuda:77'"), ("", "unknown device")],
+)
+def test_a_device_that_is_not_there_is_refused_before_the_run_is_read(
+    device: str, message: str, trained: Path
+) -> None:
+    with pytest.raises(BadInput, match=message):
+        load_policy(trained / "bc-0", device)
+    assert load_policy(trained / "bc-0", "auto").agent == "bc"
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("CUDA out of memory")])
+def test_too_little_memory_is_no_damage_of_a_run(
+    error: Exception, trained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def build(*_: object) -> None:
+        raise error
+
+    monkeypatch.setitem(AGENTS, "bc", replace(AGENTS["bc"], build=build))
+    with pytest.raises(type(error)):
+        load_policy(trained / "bc-0")

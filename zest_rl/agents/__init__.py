@@ -15,6 +15,7 @@ import torch
 
 from zest_rl.agents import bc, dt, foreign
 from zest_rl.agents.base import Agent, DataFacts, Policy
+from zest_rl.embedders import find_device
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime.artifacts import hash_bytes, read_json
 from zest_rl.runtime.records import from_json, reading_record
@@ -44,44 +45,46 @@ def load_policy(run_dir: Path, device: str = "cpu", *, trust: bool = False) -> P
 
     Args:
         run_dir: the run's folder.
-        device: where the policy runs.
+        device: where the policy runs: "cpu", "cuda", "cuda:1", "mps", "auto" (CUDA where there is one, else the CPU).
         trust: run a foreign policy that was not adopted on this machine, now and from now on.
 
     Raises:
         ZestError: the run is not finished, or its weights differ from those that ``meta.json`` names.
-        BadInput: ``meta.json`` is not as this package writes it, its agent is unknown here, or a foreign policy is not
-            trusted or cannot be read.
+        BadInput: there is no such device, ``meta.json`` is not as this package writes it, its agent is unknown here, or
+            a foreign policy is not trusted or cannot be read.
     """
-    path = run_dir / "meta.json"
+    place, path = find_device(device), run_dir / "meta.json"
     meta: dict[str, Any] = read_json(path)
     with reading_record(path):
-        return _load(run_dir, meta, torch.device(device), trust=trust)
-
-
-def _load(run_dir: Path, meta: dict[str, Any], device: torch.device, *, trust: bool) -> Policy:
-    if meta["agent"] == foreign.FOREIGN:
-        if trust:
+        is_foreign = meta["agent"] == foreign.FOREIGN
+        if is_foreign and trust:
             remember("policy", meta["policy"])
-        return foreign.load(run_dir, meta, device)
-    agent = get_agent(meta["agent"])
+    return foreign.load(run_dir, meta, place) if is_foreign else _load(run_dir, meta, place)
+
+
+def _load(run_dir: Path, meta: dict[str, Any], device: torch.device) -> Policy:
+    with reading_record(run_dir / "meta.json"):
+        agent, sha256 = get_agent(meta["agent"]), str(meta["model_sha256"])
+        config = from_json(agent.config, meta["config"])
+        facts = from_json(DataFacts, {field.name: meta[field.name] for field in fields(DataFacts)})
     path = run_dir / "model.safetensors"
     try:
         weights = path.read_bytes()
     except OSError as error:
         raise ZestError(f"cannot read {path}: {error.strerror}; train again into a new folder") from error
-    if hash_bytes(weights) != meta["model_sha256"]:
+    if hash_bytes(weights) != sha256:
         raise ZestError(
-            f"{path} is damaged: its sha256 is {hash_bytes(weights)}, meta.json says {meta['model_sha256']}; "
+            f"{path} is damaged: its sha256 is {hash_bytes(weights)}, meta.json says {sha256}; "
             "restore it from a copy or train again into a new folder"
         )
-    config = from_json(agent.config, meta["config"])
-    facts = from_json(DataFacts, {field.name: meta[field.name] for field in fields(DataFacts)})
-    tensors = safetensors.torch.load(weights)
-    with torch.random.fork_rng(devices=[]):  # the random initial weights are replaced below
+    with reading_record(run_dir / "meta.json"), torch.random.fork_rng(devices=[]):  # initial weights are replaced
+        tensors = safetensors.torch.load(weights)
         with torch.device("meta"):  # makes no room yet
             shapes = {name: tensor.shape for name, tensor in agent.build(config, facts).state_dict().items()}
         if shapes != {name: tensor.shape for name, tensor in tensors.items()}:
             raise ValueError(f"its config is not that of {path.name}")
         model = agent.build(config, facts)
-    model.load_state_dict(tensors)
-    return agent.policy(model.to(device).eval(), config, facts, meta, device)
+        model.load_state_dict(tensors)
+    model = model.to(device).eval()
+    with reading_record(run_dir / "meta.json"):
+        return agent.policy(model, config, facts, meta, device)

@@ -19,6 +19,7 @@ unpickles its models in its own process. So `load` wants each to be trusted (`ze
 from __future__ import annotations
 
 import importlib.metadata
+import operator
 import shlex
 import shutil
 import warnings
@@ -38,7 +39,7 @@ from zest_rl.agents.child import PolicyProcess
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime.artifacts import hash_file
 from zest_rl.runtime.files import user_path
-from zest_rl.runtime.records import from_json
+from zest_rl.runtime.records import from_json, reading_record
 from zest_rl.runtime.trust import check_trusted
 from zest_rl.types import FloatArray
 
@@ -283,21 +284,21 @@ def load(run_dir: Path, meta: dict[str, Any], device: torch.device) -> ForeignPo
     """Return the policy of a run that `zest_rl.training.adoption.adopt` made.
 
     Raises:
-        BadInput: it is not trusted, a file cannot be read, or its family is not known here.
+        BadInput: its description is damaged, it is not trusted, a file cannot be read, or its family is not known here.
         ZestError: a file is missing or was changed, or the library that reads it is not installed.
     """
-    identity = PolicyIdentity.from_json(meta["policy"])
-    check_trusted(
-        "policy", meta["policy"], f"{run_dir} holds the policy {meta['name']!r}, which {identity.what_runs()}"
-    )
-    for name, sha256 in identity.files.items():
-        path = run_dir / name
+    with reading_record(run_dir / "meta.json"):
+        identity, name = PolicyIdentity.from_json(meta["policy"]), str(meta["name"])
+        obs_dim, act_dim = operator.index(meta["obs_dim"]), operator.index(meta["act_dim"])
+    check_trusted("policy", meta["policy"], f"{run_dir} holds the policy {name!r}, which {identity.what_runs()}")
+    for file, sha256 in identity.files.items():
+        path = run_dir / file
         if not path.is_file() or hash_file(path) != sha256:
             raise ZestError(
                 f"{path} is missing or was changed since `zest adopt` saw it, which makes it another policy; restore "
                 "it, or adopt the new one"
             )
-    paths = {name: str(run_dir / name) for name in identity.files}  # absolute paths stay as they are
+    paths = {file: str(run_dir / file) for file in identity.files}  # absolute paths stay as they are
     words = [paths.get(word, word) for word in identity.words]
     if identity.family == "torchscript":
         return ForeignPolicy(_read_torchscript(Path(words[0]), device), meta)
@@ -306,7 +307,7 @@ def load(run_dir: Path, meta: dict[str, Any], device: torch.device) -> ForeignPo
     if identity.family in FAMILIES:
         if identity.family == "d3rlpy":
             words.insert(1, str(Path(__file__).with_name("serve_d3rlpy.py")))
-        return ForeignPolicy(PolicyProcess(words, meta["obs_dim"], meta["act_dim"]), meta)
+        return ForeignPolicy(PolicyProcess(words, obs_dim, act_dim), meta)
     return ForeignPolicy(_build_registered(identity), meta)
 
 

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from zest_rl.embedders.base import Network
 
-__all__ = ["DEFAULT_EMBEDDER", "Embedder", "Precision", "load_embedder"]
+__all__ = ["DEFAULT_EMBEDDER", "Embedder", "Precision", "find_device", "load_embedder"]
 
 Precision = Literal["auto", "fp32", "bf16"]
 
@@ -201,12 +201,24 @@ def computes_bf16(device: str) -> bool:
     return device != "mps" and bool(flags & {"avx512_bf16", "amx_bf16", "bf16"})
 
 
-def _place(network: Network, device: str, bf16: bool) -> Network:
+def find_device(device: str) -> torch.device:
+    """Return the device of this name; ``auto`` is CUDA where there is one, else the CPU.
+
+    Raises:
+        BadInput: unknown name, or this machine has no such device.
+    """
+    _check_device(device)
     import torch
 
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
-    return network.place(device, torch.bfloat16 if bf16 else torch.float32)
+    return torch.device(device)
+
+
+def _place(network: Network, device: str, bf16: bool) -> Network:
+    import torch
+
+    return network.place(find_device(device), torch.bfloat16 if bf16 else torch.float32)
 
 
 def _fingerprint(uri: str, network: Network, bf16: bool) -> str:

@@ -48,7 +48,7 @@ class Network:
         with torch.inference_mode():
             return self.embed_frames([np.zeros((8, 8, 3), np.uint8)]).shape[1]
 
-    def place(self, device: str, dtype: torch.dtype) -> Network:
+    def place(self, device: torch.device, dtype: torch.dtype) -> Network:
         """Move the module, in the memory layout that is fastest for convolutions, and return self."""
         self.module.to(device=device, dtype=dtype)
         self.module.to(memory_format=torch.channels_last)

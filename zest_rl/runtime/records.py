@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from zest_rl.errors import BadInput, ZestError
+from zest_rl.runtime.address_space import is_out_of_memory
 
 T = TypeVar("T")
 
@@ -25,13 +26,16 @@ def reading_record(path: Path, advice: str = "restore it from a copy, or make it
     """Name the file if what it holds has other keys, types or sizes than what this package writes.
 
     Raises:
-        BadInput: anything that the block raises but a `ZestError`, which is passed on, and an `OSError`.
+        BadInput: anything that the block raises but what says something else than that the file is wrong, which is
+            passed on: a `ZestError`, an `OSError`, and too little memory.
     """
     try:
         yield
     except (ZestError, OSError):
         raise
     except Exception as error:
+        if is_out_of_memory(error):
+            raise
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
         raise BadInput(f"{path} is not as this package writes it ({reason}); {advice}") from error
 
