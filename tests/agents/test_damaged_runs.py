@@ -122,16 +122,19 @@ def test_a_damaged_checkpoint_of_a_training_is_read_or_refused_even_under_its_ow
     (folder,) = (tmp_path / "checkpoints").iterdir()
     whole = {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "manifest.json"}
     progress, rng = json.loads(whole["state.json"]), random.Random(0)
+    manifest = {name: artifacts.hash_bytes(content) for name, content in whole.items()}
     damaged = [("state.json", whole["state.json"])]
     for _ in range(n):
         name = rng.choice(sorted(whole))
         damaged.append((name, damaged_bytes(whole[name], rng)))
         damaged.append(("state.json", json.dumps(damaged_json(progress, rng)).encode()))
+        damaged.append(("manifest.json", json.dumps(damaged_json(manifest, rng)).encode()))
 
     def read(i: int) -> int:
-        for name, content in (whole | dict([damaged[i]])).items():
+        files = whole | dict([damaged[i]])
+        hashes = {name: artifacts.hash_bytes(files[name]) for name in whole}
+        for name, content in ({"manifest.json": json.dumps(hashes).encode()} | files).items():
             (folder / name).write_bytes(content)
-        artifacts.write_json(folder / "manifest.json", {name: artifacts.hash_file(folder / name) for name in whole})
         restored = state()
         resume(tmp_path, restored)
         return restored.update
@@ -169,9 +172,7 @@ def test_a_run_that_asks_for_absurd_room_is_refused_before_it_is_made(
     ("device", "message"),
     [("nonsense", "unknown device 'nonsense'"), ("cuda:77", "torch finds no device 'cuda:77'"), ("", "unknown device")],
 )
-def test_a_device_that_is_not_there_is_refused_before_the_run_is_read(
-    device: str, message: str, trained: Path
-) -> None:
+def test_a_device_that_is_not_there_is_refused_before_the_run_is_read(device: str, message: str, trained: Path) -> None:
     with pytest.raises(BadInput, match=message):
         load_policy(trained / "bc-0", device)
     assert load_policy(trained / "bc-0", "auto").agent == "bc"

@@ -24,7 +24,7 @@ from zest_rl.agents.bc import BCConfig
 from zest_rl.agents.dt import DTConfig
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.training import loop
-from zest_rl.training.checkpoints import TrainState, save_checkpoint, snapshot_folder
+from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint, snapshot_folder
 from zest_rl.training.loop import TrainingConfig, fit
 from zest_rl.types import Episode
 
@@ -293,3 +293,24 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:
     config = BCConfig(hidden_size=4, n_layers=1, batch_size=4, learning_rate=1e38, warmup_updates=0, amp="fp32")
     with pytest.raises(ZestError, match="must be finite"):
         fit("bc", config, make_episodes(), tmp_path / "run", TrainingConfig(n_updates=50, threads=1))
+
+
+@pytest.mark.parametrize("file", ["model.safetensors", "state.json", "manifest.json"])
+def test_a_checkpoint_of_devices_in_place_of_files_is_refused(file: str, tmp_path: Path) -> None:
+    state = TrainState.start(torch.nn.Linear(3, 2), 0.0, 0)
+    save_checkpoint(tmp_path, state)
+    (folder,) = (tmp_path / "checkpoints").iterdir()
+    (folder / file).unlink()
+    (folder / file).symlink_to("/dev/zero")
+    with pytest.raises(ZestError, match=f"damaged: {file} is not what was written"):
+        resume(tmp_path, state)
+
+
+@pytest.mark.parametrize("manifest", [{}, [], None, {"/dev/zero": "0"}, {"a\0": "0"}, {"state.json": []}])
+def test_a_manifest_of_other_files_than_those_of_a_checkpoint_is_refused(manifest: Any, tmp_path: Path) -> None:
+    state = TrainState.start(torch.nn.Linear(3, 2), 0.0, 0)
+    save_checkpoint(tmp_path, state)
+    (folder,) = (tmp_path / "checkpoints").iterdir()
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(ZestError, match=r"damaged: manifest\.json is not what was written"):
+        resume(tmp_path, state)

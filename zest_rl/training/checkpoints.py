@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,9 +15,12 @@ from torch import Tensor, nn
 
 from zest_rl.errors import ZestError
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.files import check_file
 from zest_rl.runtime.records import reading_record
 
 N_CHECKPOINTS = 2
+_PARTS = ("model", "optimizer", "average", "generators")
+_FILES = {"state.json", *(f"{part}.safetensors" for part in _PARTS)}
 
 
 @dataclass
@@ -74,7 +78,7 @@ def save_checkpoint(run_dir: Path, state: TrainState) -> None:
     if device.type == "cuda":
         generators["cuda"] = torch.cuda.get_rng_state(device)
     weights = state.model.state_dict()
-    parts = {"model": weights, "optimizer": moments, "average": state.average, "generators": generators}
+    parts = dict(zip(_PARTS, (weights, moments, state.average, generators), strict=True))
     artifacts.check_free_space(run_dir, sum(t.nbytes for tensors in parts.values() for t in tensors.values()))
     with artifacts.staged_folder(folder) as staging:
         for name, tensors in parts.items():
@@ -121,10 +125,7 @@ def resume(run_dir: Path, state: TrainState) -> None:
 
 
 def _restore(folder: Path, state: TrainState) -> None:
-    tensors = {
-        name: safetensors.torch.load_file(folder / f"{name}.safetensors")
-        for name in ("model", "optimizer", "average", "generators")
-    }
+    tensors = {name: safetensors.torch.load_file(folder / f"{name}.safetensors") for name in _PARTS}
     state.model.load_state_dict(tensors["model"])
     for name, mean in state.average.items():
         mean.copy_(tensors["average"][name])
@@ -146,12 +147,20 @@ def _restore(folder: Path, state: TrainState) -> None:
     state.rng.bit_generator.state = progress["sampler"]
 
 
-def _verify(folder: Path) -> None:
+def _is_whole(path: Path, sha256: str) -> bool:
     try:
-        manifest: dict[str, str] = artifacts.read_json(folder / "manifest.json")
-        bad = [name for name, sha256 in manifest.items() if artifacts.hash_file(folder / name) != sha256]
-    except (ZestError, OSError, AttributeError):
-        bad = ["manifest.json"]
+        check_file(path)
+        return artifacts.hash_file(path) == sha256
+    except (ZestError, OSError):
+        return False
+
+
+def _verify(folder: Path) -> None:
+    bad = ["manifest.json"]
+    with suppress(ZestError):
+        manifest = artifacts.read_json(folder / "manifest.json")
+        if isinstance(manifest, dict) and set(manifest) == _FILES:
+            bad = [name for name in sorted(_FILES) if not _is_whole(folder / name, manifest[name])]
     if bad:
         raise ZestError(
             f"checkpoint {folder} is damaged: {', '.join(bad)} is not what was written; delete this folder and start "

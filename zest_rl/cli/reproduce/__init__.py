@@ -8,8 +8,9 @@ finished cell is never run again.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,8 +19,9 @@ import tyro
 from zest_rl.cli import follow, inspect, select
 from zest_rl.cli.config import load_config, read_recipe
 from zest_rl.cli.reproduce import study_tables, tables
+from zest_rl.cli.reproduce.comparison import read_comparison
 from zest_rl.cli.reproduce.pipeline import run_comparison
-from zest_rl.cli.reproduce.study import run_study
+from zest_rl.cli.reproduce.study import read_study, run_study
 from zest_rl.cli.ui import SilentUi, Ui
 
 VERBS = {
@@ -72,22 +74,33 @@ def reproduce(
     ui = SilentUi() if ui is None else ui
     output = output or Path("runs") / file.stem
     recipe = read_recipe(file)
+    work: Callable[[], dict[str, Any]]
+    if recipe.get("verb") in VERBS:
+        work = _verb(recipe, f"recipe {file}", output, ui, n_workers)
+    elif "study" in recipe:
+        work = partial(run_study, read_study(file), output, ui, n_workers=n_workers)
+    else:
+        work = partial(run_comparison, read_comparison(file), file.name, output, ui, n_workers=n_workers)
     with artifacts.lock(output):
-        if recipe.get("verb") in VERBS:
-            return _run_verb(recipe, f"recipe {file}", output, ui, n_workers)
-        run_recipe = run_study if "study" in recipe else run_comparison
-        return run_recipe(file, output, ui, n_workers=n_workers)
+        return work()
 
 
-def _run_verb(recipe: dict[str, Any], source: str, output: Path, ui: Ui, n_workers: int | None) -> dict[str, Any]:
-    """Run the verb that the recipe is of; write result.json and, where the verb has a page, report.html."""
-    from zest_rl.runtime import artifacts
-
+def _verb(
+    recipe: dict[str, Any], source: str, output: Path, ui: Ui, n_workers: int | None
+) -> Callable[[], dict[str, Any]]:
+    """Read the arguments of the verb that the recipe is of; return what runs it."""
     module, config_class = VERBS[recipe.pop("verb")]
     given = {"output": str(output / "report.html"), "n_workers": n_workers}
     flags = {field.name for field in fields(config_class)}
     recipe |= {key: value for key, value in given.items() if key in flags and value is not None}
-    result = module.run(load_config(config_class, recipe, source), ui)
+    return partial(_run_verb, module, load_config(config_class, recipe, source), output, ui)
+
+
+def _run_verb(module: Any, config: Any, output: Path, ui: Ui) -> dict[str, Any]:
+    """Run a verb; write result.json and, where the verb has a page, report.html."""
+    from zest_rl.runtime import artifacts
+
+    result = module.run(config, ui)
     kept = {key: value for key, value in result.items() if key not in ("report", "next")}
     artifacts.write_json(output / "result.json", {**kept, "provenance": artifacts.provenance()})
     return {**result, "result": str(output / "result.json")}

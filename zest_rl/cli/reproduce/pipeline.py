@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from zest_rl.cli.reproduce.cells import Cell, TaskDatasets, make_cells, run_cells, seconds_of
-from zest_rl.cli.reproduce.comparison import Comparison, read_comparison
+from zest_rl.cli.reproduce.comparison import Comparison
 from zest_rl.cli.reproduce.tables import as_markdown
 from zest_rl.cli.ui import Ui
 
@@ -19,14 +19,15 @@ if TYPE_CHECKING:
     from zest_rl.report.sections import Report
 
 
-def run_comparison(path: Path, output: Path, ui: Ui, *, n_workers: int | None = None) -> dict[str, Any]:
-    """Collect, relabel, train, evaluate and report what is not done yet."""
+def run_comparison(
+    comparison: Comparison, recipe: str, output: Path, ui: Ui, *, n_workers: int | None = None
+) -> dict[str, Any]:
+    """Collect, relabel, train, evaluate and report what is not done yet; `recipe` is the name of the recipe's file."""
     from zest_rl.cli import inspect
     from zest_rl.kitchen.videos import ensure_videos, missing
     from zest_rl.report.html import write_report
     from zest_rl.runtime import artifacts
 
-    comparison = read_comparison(path)
     datasets = {task: _make_datasets(comparison, task, n_workers, ui) for task in comparison.collect}
     if not comparison.methods:
         relabeled = tuple(
@@ -40,7 +41,7 @@ def run_comparison(path: Path, output: Path, ui: Ui, *, n_workers: int | None = 
     n_run = run_cells(cells, output, ui, n_workers=n_workers)
     ui.say("[4/4] report")
     videos: list[Video] = []
-    details = {"recipe": {"file": path.name, **asdict(comparison.tables)}}
+    details = {"recipe": {"file": recipe, **asdict(comparison.tables)}}
     task_pages, page = _pages(comparison, cells, datasets, details, videos)
     result = {
         "rows": _rows(page),

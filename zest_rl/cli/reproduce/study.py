@@ -120,13 +120,12 @@ def read_study(path: Path) -> Study:
     return Study(tables, collect, tuple(settings))
 
 
-def run_study(path: Path, output: Path, ui: Ui, *, n_workers: int | None = None) -> dict[str, Any]:
+def run_study(study: Study, output: Path, ui: Ui, *, n_workers: int | None = None) -> dict[str, Any]:
     """Collect what is not there, select in every cell, and write result.json, table.md and report.html."""
     from zest_rl.cli import collect
     from zest_rl.report.html import write_report
     from zest_rl.runtime import artifacts
 
-    study = read_study(path)
     datasets = {}
     for task, config in study.collect.items():
         ui.say(f"[1/2] collect {task}")
