@@ -6,6 +6,7 @@ import json
 import random
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -19,6 +20,11 @@ from zest_rl.rewards.scorer import SCORER_FILE, check_scorer
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.artifacts import hash_json
 from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint
+
+
+def damages(whole: Any, n: int, rng: random.Random) -> list[Any]:
+    return [damaged_json(whole, rng) for _ in range(n)]
+
 
 COUNTS = [60, pytest.param(1500, marks=pytest.mark.slow)]
 
@@ -87,6 +93,26 @@ def test_a_damaged_scorer_is_read_or_refused(n: int, trained: Path) -> None:
     assert first.kind == "read", first.detail
     counts, bad = faults(others)
     print("scorer", len(others), dict(counts))
+    assert not bad, bad[0].detail
+
+
+@pytest.mark.parametrize("n", COUNTS)
+def test_a_damaged_environment_of_a_run_is_evaluated_or_refused(n: int, trained: Path) -> None:
+    path, rng = trained / "bc-0" / "meta.json", random.Random(0)
+    meta = artifacts.read_json(path)
+    spec = json.loads(meta["dataset"]["env_spec"]) | {"max_episode_steps": 1}
+    damaged = [meta["dataset"] | {"env_spec": json.dumps(value)} for value in (spec, *damages(spec, n, rng))]
+    references = {"ref_min_score": 0.0, "ref_max_score": 70.0}
+    damaged += [meta["dataset"] | {"env_spec": json.dumps(spec)} | value for value in damages(references, n // 4, rng)]
+
+    def read(i: int) -> str:
+        artifacts.write_json(path, meta | {"dataset": damaged[i]})
+        return hash_json(evaluate(path.parent, EvaluationConfig(n_episodes=1, seed=i), n_workers=1).summary())
+
+    first, *others = outcomes(read, len(damaged))
+    assert first.kind == "read", first.detail
+    counts, bad = faults(others)
+    print("environment", len(others), dict(counts))
     assert not bad, bad[0].detail
 
 

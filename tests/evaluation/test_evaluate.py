@@ -35,6 +35,7 @@ from zest_rl.kitchen.env import ENV_ID, HORIZON, KitchenEnv, env_spec
 from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.arrays import read_arrays, write_arrays
 
 ONLINE = EvaluationConfig(n_episodes=2, seed=11)
 CONSTANT = replace(ONLINE, rtg="constant")
@@ -263,6 +264,43 @@ def test_a_damaged_part_is_run_again_and_reading_it_says_so(trained: Path) -> No
     assert_equal(evaluate(trained / "bc-0", CONSTANT, n_workers=1).traces, first.traces)
 
 
+def change_part(folder: Path, change: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+    (part,) = (folder / "parts").glob("*.npz")
+    arrays = read_arrays(part)
+    assert arrays is not None
+    write_arrays(part, change(arrays))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda a: {name: array for name, array in a.items() if name != "gt_success"},
+        lambda a: a | {"surprise": a["gt_reward"]},
+        lambda a: a | {"gt_reward": a["gt_reward"][:, :, None]},
+        lambda a: a | {"gt_reward": a["gt_reward"][:, :1]},
+        lambda a: a | {"gt_reward": np.full_like(a["gt_reward"], np.nan)},
+        lambda a: a | {"gt_reward": a["gt_reward"].astype("U9")},
+        lambda a: a | {"gt_success": a["gt_success"][:1]},
+        lambda a: a | {"qpos": a["qpos"][..., :3]},
+    ],
+)
+def test_parts_of_somebody_else_that_hold_other_arrays_are_refused(
+    change: Callable[[dict[str, Any]], dict[str, Any]], trained: Path
+) -> None:
+    folder = evaluate(trained / "bc-0", CONSTANT, n_workers=1).folder
+    change_part(folder, change)
+    for read_again in (lambda: read_evaluation(folder), lambda: evaluate(trained / "bc-0", CONSTANT, n_workers=1)):
+        with pytest.raises(BadInput, match=r"parts is not as this package writes it.*evaluate again"):
+            read_again()
+
+
+def test_a_result_that_contradicts_its_parts_is_refused(trained: Path) -> None:
+    folder = evaluate(trained / "bc-0", CONSTANT, n_workers=1).folder
+    change_part(folder, lambda arrays: arrays | {"gt_reward": arrays["gt_reward"] + np.float32(0.1)})
+    with pytest.raises(BadInput, match="its episodes are not those of its parts"):
+        read_evaluation(folder)
+
+
 # --- refusals ---------------------------------------------------------------------------------------------------------
 
 
@@ -318,6 +356,22 @@ def test_weights_that_were_changed_are_refused(trained: Path) -> None:
         ({"entry_point": "zest_rl.cli:main"}, f"{ENV_ID} would run code of 'zest_rl.cli:main', but is registered as"),
         ({"max_episode_steps": None}, "with max_episode_steps None"),
         ({"max_episode_steps": 10**12}, "with max_episode_steps 1000000000000"),
+        ({"kwargs": {"x": 1}}, "takes a task and an init_noise, got {'x': 1}"),
+        ({"kwargs": {"init_noise": "a"}}, "init_noise must be float, got 'a'"),
+        ({"kwargs": {"init_noise": float("nan")}}, "init_noise must be finite"),
+        ({"kwargs": {"task": ["micro"]}}, "task must be str"),
+        (
+            {
+                "additional_wrappers": [
+                    {
+                        "name": "v",
+                        "entry_point": "gymnasium.wrappers:RecordVideo",
+                        "kwargs": {"video_folder": "/tmp"},
+                    }
+                ]
+            },
+            "is evaluated without wrappers",
+        ),
         ({"unheard_of": 1}, "the environment of the run is not the JSON of a Gymnasium EnvSpec"),
     ],
 )

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import Any, get_args
 
@@ -20,6 +20,7 @@ from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput, nearest
 from zest_rl.evaluation.rollout import Rtg, Traces, run_episodes, uses_online_scores
 from zest_rl.kitchen.env import ENV_ID
+from zest_rl.kitchen.scene import N_QPOS
 from zest_rl.kitchen.videos import Video, ensure_videos
 from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return, representative, wilson
 from zest_rl.rewards.scorer import SCORER_FILE, check_scorer
@@ -199,7 +200,7 @@ def evaluate(
         for name in cached_jobs(_evaluate_part, jobs, folder / "parts", n_workers=n_workers, stage="rollouts"):
             if on_progress is not None:
                 on_progress(len(jobs[name][2]))
-        traces = read_parts(folder / "parts", jobs)
+        traces = _read_traces(folder, list(jobs), config)
         result = Evaluation(
             run,
             config,
@@ -249,6 +250,7 @@ def read_evaluation(folder: Path) -> Evaluation:
     """Read the result of `evaluate` from ``RUN/evaluations/NAME``.
 
     Raises:
+        BadInput: the result is not as this package writes it, or its episodes are not those of its parts.
         ZestError: there is no result, or a part is damaged; evaluate again.
     """
     path = folder / "result.json"
@@ -261,9 +263,10 @@ def read_evaluation(folder: Path) -> Evaluation:
         minimum, expert = float(references["minimum"]), float(references["expert"])
         if len(episodes) != config.n_episodes or not -math.inf < minimum < expert < math.inf:
             raise ValueError(f"{len(episodes)} episodes, returns of {minimum} to {expert}")
-        traces = read_parts(folder / "parts", [Path(name).name for name in result["parts"]])
-        if len(traces["gt_reward"]) != config.n_episodes:
-            raise ValueError(f"its parts hold {len(traces['gt_reward'])} episodes")
+        traces = _read_traces(folder, [Path(name).name for name in result["parts"]], config)
+        told, seen = map(_numbers, (episodes, _episode_results(traces, config)))
+        if not np.allclose(told, seen, rtol=1e-9, equal_nan=True):
+            raise ValueError("its episodes are not those of its parts")
     return Evaluation(folder.parent.parent, config, target, minimum, expert, episodes, traces)
 
 
@@ -278,6 +281,27 @@ def episode_videos(evaluation: Evaluation) -> dict[str, Video]:
         which: Video(evaluation.traces["qpos"][index], evaluation.folder / f"{which}.mp4")
         for which, index in representative(evaluation.normalized()).items()
     }
+
+
+def _read_traces(folder: Path, parts: Sequence[str], config: EvaluationConfig) -> Traces:
+    """Read the parts of an evaluation, which may be somebody else's."""
+    with reading_record(folder / "parts", "delete this folder and evaluate again"):
+        traces = read_parts(folder / "parts", parts)
+        n, n_frames = config.n_episodes, traces["gt_reward"].shape[1]
+        layout = {
+            "gt_reward": (np.float32, (n, n_frames)), "gt_success": (np.bool_, (n, n_frames)),
+            "qpos": (np.float64, (n, n_frames, N_QPOS)), "score": (np.float32, (n, n_frames)),
+            "clipped": (np.int64, (n,)),
+        }  # fmt: skip
+        for name in ("gt_reward", "gt_success", "qpos", *traces):
+            array, (dtype, shape) = traces[name], layout[name]
+            if array.shape != shape or array.dtype != dtype or n_frames < 2 or not np.isfinite(array).all():
+                raise ValueError(f"{name} must be finite {np.dtype(dtype)} {shape}, got {array.dtype} {array.shape}")
+    return traces
+
+
+def _numbers(episodes: Sequence[EpisodeResult]) -> NDArray[np.float64]:
+    return np.array([astuple(episode) for episode in episodes], dtype=np.float64)  # None becomes NaN
 
 
 def _episode_results(traces: Traces, config: EvaluationConfig) -> tuple[EpisodeResult, ...]:

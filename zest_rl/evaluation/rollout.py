@@ -7,6 +7,7 @@ rewards. Ground-truth rewards are recorded; only a policy that was trained on th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import gymnasium
@@ -17,8 +18,9 @@ from zest_rl.agents import Policy
 from zest_rl.data.env_specs import check_env_spec, check_registered
 from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput
-from zest_rl.kitchen.env import ENV_ID
+from zest_rl.kitchen.env import ENV_ID, env_spec
 from zest_rl.rewards.state_scorer import StateScorer
+from zest_rl.runtime.records import from_json
 from zest_rl.types import FloatArray
 
 Rtg = Literal["online", "constant", "schedule"]
@@ -100,11 +102,19 @@ def _record(policy: Policy) -> DatasetRecord:
     return DatasetRecord.of_run(policy.meta)
 
 
-def _kitchen_spec(env_spec: str) -> gymnasium.envs.registration.EnvSpec:
-    """Read the EnvSpec of a run, which may come from somebody else and must not choose what code is run."""
-    check_env_spec(env_spec, "the environment of the run", "evaluate a run on a dataset of the kitchen")
+@dataclass(frozen=True)
+class _Arguments:
+    """Of `KitchenEnv`."""
+
+    task: str = "micro"
+    init_noise: float = 0.05
+
+
+def _kitchen_spec(text: str) -> gymnasium.envs.registration.EnvSpec:
+    """Read the EnvSpec of a run, which may come from somebody else: task, noise and horizon are all it may choose."""
+    check_env_spec(text, "the environment of the run", "evaluate a run on a dataset of the kitchen")
     try:
-        spec = gymnasium.envs.registration.EnvSpec.from_json(env_spec)
+        spec = gymnasium.envs.registration.EnvSpec.from_json(text)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise BadInput(f"the environment of the run is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
     horizon = spec.max_episode_steps
@@ -114,7 +124,19 @@ def _kitchen_spec(env_spec: str) -> gymnasium.envs.registration.EnvSpec:
             f"max_episode_steps {horizon}; train on a dataset of `zest collect`"
         )
     check_registered(spec)
-    return spec
+    try:
+        arguments = from_json(_Arguments, spec.kwargs)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise BadInput(
+            f"the environment of the run takes a task and an init_noise, got {spec.kwargs!r:.200} ({error}); train on "
+            "a dataset of `zest collect`"
+        ) from error
+    if spec.additional_wrappers:
+        raise BadInput(
+            f"the environment of the run is evaluated without wrappers, got {spec.additional_wrappers!r:.200}; train "
+            "on a dataset that was recorded without"
+        )
+    return replace(env_spec(**asdict(arguments)), max_episode_steps=horizon)
 
 
 def _ground_truth(infos: Sequence[Mapping[str, Any]]) -> Traces:
