@@ -15,11 +15,13 @@ from fuzzing import damaged_bytes, damaged_json, faults, outcome, outcomes
 from zest_rl.agents import AGENTS, load_policy
 from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import EvaluationConfig, evaluate, read_evaluation
+from zest_rl.report.comparison_page import learning_curve
 from zest_rl.report.methods import methods_of_runs
 from zest_rl.rewards.scorer import SCORER_FILE, check_scorer
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.artifacts import hash_json
 from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint
+from zest_rl.training.log import MetricsLog
 
 
 def damages(whole: Any, n: int, rng: random.Random) -> list[Any]:
@@ -130,6 +132,26 @@ def test_a_damaged_result_of_an_evaluation_is_read_or_refused(n: int, trained: P
     assert first.kind == "read", first.detail
     counts, bad = faults(others)
     print("result.json", n, dict(counts))
+    assert not bad, bad[0].detail
+
+
+@pytest.mark.parametrize("n", COUNTS)
+def test_a_damaged_log_of_a_training_is_read_or_refused(n: int, trained: Path) -> None:
+    path, rng = trained / "bc-0" / "metrics.csv", random.Random(0)
+    (method,) = methods_of_runs([trained / "bc-0"])
+    whole = path.read_bytes()
+    damaged = [whole, b"update,loss\n\xff,1\n", *(damaged_bytes(whole, rng) for _ in range(n))]
+
+    def read(i: int) -> None:
+        path.write_bytes(damaged[i])
+        learning_curve(method)
+        with MetricsLog(path.parent, 20):
+            pass
+
+    first, *others = outcomes(read, len(damaged))
+    assert first.kind == "read", first.detail
+    counts, bad = faults(others)
+    print("metrics.csv", len(others), dict(counts))
     assert not bad, bad[0].detail
 
 

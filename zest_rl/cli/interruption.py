@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 INTERRUPTED = "interrupted; run the same command again to go on"
@@ -36,7 +36,8 @@ def interruptible() -> Iterator[list[int]]:
         raise KeyboardInterrupt(number)
 
     def end(number: int, frame: FrameType | None) -> None:
-        os.write(2, f"{INTERRUPTED}\n".encode())
+        with suppress(OSError):  # nobody reads
+            os.write(2, f"{INTERRUPTED}\n".encode())
         os._exit(128 + number)
 
     signals = (each for each in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(each) is not signal.SIG_IGN)

@@ -35,6 +35,8 @@ from zest_rl.report.sections import (
 )
 from zest_rl.rewards.scorer import SCORER_FILE, check_scorer
 from zest_rl.rewards.state_scorer import StateScorer
+from zest_rl.runtime.files import check_file
+from zest_rl.runtime.records import reading_record
 from zest_rl.training.checkpoints import snapshots
 
 
@@ -111,7 +113,9 @@ def learning_curve(method: Method) -> Curve | None:
     if not all((run / "metrics.csv").exists() for run in method.runs):
         return None  # a snapshot has no log
     for run in method.runs:
-        with (run / "metrics.csv").open(newline="", encoding="utf-8") as file:
+        path = run / "metrics.csv"
+        check_file(path)
+        with reading_record(path), path.open(newline="", encoding="utf-8") as file:
             columns.append([(float(row["update"]), float(row["loss"])) for row in csv.DictReader(file)])
     length = min(map(len, columns))
     if length < 2:
@@ -155,9 +159,14 @@ def compare_runs(runs: Sequence[Path], *, title: str, trust: bool = False) -> Re
             if goals.setdefault(goal, dataset.id) != dataset.id:
                 goals[f"{goal} ({dataset.id})"] = dataset.id
     source = sources.pop() if len(sources) == 1 else None
-    for dataset_id in goals.values() if trust else ():
-        check_scorer(dataset_path(dataset_id) / SCORER_FILE, trust=True)
+    if trust and goals:
+        check_scorer(_scorer_file(goals), trust=True)
     return compare(title, methods, source_id=source if source is not None and exists(source) else None, goals=goals)
+
+
+def _scorer_file(goals: Mapping[str, str]) -> Path:
+    """Return the scorer that scores the episodes of the page: that of the first goal."""
+    return dataset_path(next(iter(goals.values()))) / SCORER_FILE
 
 
 def compare(
@@ -202,7 +211,7 @@ def compare(
                 goal_panels.append(goal_panel(name, ds.record.relabel, ds.path, scatters[-1]))
     scorer = None
     if goals:
-        scorer = StateScorer.load(dataset_path(next(iter(goals.values()))) / SCORER_FILE)
+        scorer = StateScorer.load(_scorer_file(goals))
     contenders = [method for method in methods if method.kind == "method"]
     episodes = [
         episode

@@ -13,6 +13,7 @@ from typing import Self
 from torch.utils.tensorboard import SummaryWriter
 
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.records import reading_record
 
 COLUMNS = ("loss", "grad_norm", "learning_rate", "updates_per_s")
 
@@ -21,10 +22,16 @@ class MetricsLog:
     """Appends rows to the log of a run; use it as a context manager."""
 
     def __init__(self, run_dir: Path, n_done: int) -> None:
-        """Open the log, and drop the rows that a killed run logged after update `n_done`."""
+        """Open the log, and drop the rows that a killed run logged after update `n_done`.
+
+        Raises:
+            BadInput: what is there is no log.
+        """
         path, header = run_dir / "metrics.csv", ",".join(("update", *COLUMNS))
-        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() and n_done else []
-        kept = [line for line in lines[1:] if line.count(",") == len(COLUMNS) and int(line.partition(",")[0]) <= n_done]
+        with reading_record(path, "delete it to go on without the rows before this update"):
+            lines = path.read_text(encoding="utf-8").splitlines() if path.exists() and n_done else []
+            whole = [line for line in lines[1:] if line.count(",") == len(COLUMNS)]
+            kept = [line for line in whole if int(line.partition(",")[0]) <= n_done]
         artifacts.write_bytes(path, "".join(f"{line}\n" for line in (header, *kept)).encode())
         if not n_done:
             shutil.rmtree(run_dir / "tb", ignore_errors=True)
