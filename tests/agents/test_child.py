@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from tiny_dataset import SHORT_HORIZON
 
+from zest_rl.agents.child import PolicyProcess
 from zest_rl.errors import ZestError
 from zest_rl.evaluation.evaluate import EPISODES_PER_JOB, EvaluationConfig, evaluate, evaluation_folder
 
@@ -30,8 +31,8 @@ def is_alive(pid: int) -> bool:
 
 
 def group_of(process: Path) -> int | None:
-    found = status(process)
-    return int(found[2]) if found and found[0] != "Z" else None
+    fields = status(process)
+    return int(fields[2]) if fields and fields[0] != "Z" else None
 
 
 def test_every_part_has_a_process_of_its_own_that_is_told_how_many_episodes_begin_and_ends_after_them(
@@ -150,3 +151,13 @@ def test_a_timeout_that_is_no_number_is_refused(
     code, message = refusal("adopt", server(""), "--dataset", collected, "--run-dir", tmp_path / "x")
     assert code == 2
     assert "ZEST_POLICY_TIMEOUT must be seconds: could not convert string to float: 'long'" in message
+
+
+def test_a_program_that_cannot_be_started_leaves_no_open_file() -> None:
+    process = PolicyProcess(["sh", "x" * 2**22], 59, 9)  # longer than a command line may be
+    before = sorted(Path("/proc/self/fd").iterdir())
+    for _ in range(3):
+        with pytest.raises(OSError, match="Argument list too long"):
+            process.begin(1)
+    process.end()
+    assert sorted(Path("/proc/self/fd").iterdir()) == before

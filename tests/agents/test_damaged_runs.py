@@ -210,8 +210,8 @@ def test_a_run_that_asks_for_absurd_room_is_refused_before_it_is_made(
     path = trained / run / "meta.json"
     meta = artifacts.read_json(path)
     artifacts.write_json(path, meta | {"config": meta["config"] | changes})
-    found = outcome(lambda: load_policy(trained / run))
-    assert found.kind == "refused", found.detail
+    end = outcome(lambda: load_policy(trained / run))
+    assert end.kind == "refused", end.detail
     artifacts.write_json(path, meta | {"max_steps": 10**9})
     assert outcome(lambda: load_policy(trained / run)).kind == ("read" if run == "bc-0" else "refused")
 

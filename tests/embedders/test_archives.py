@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import collections
 import pickle
 import random
+import tarfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +25,8 @@ from zest_rl.embedders.checkpoints import fill, read_checkpoint, read_openai
 from zest_rl.errors import BadInput
 from zest_rl.runtime.artifacts import hash_arrays
 
+NESTED = b"K\x01" + 60 * b"2\x86"
+"""Pickle of a tuple of itself twice, 60 times: without a memory of hashes, 2^60 steps."""
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit:FutureWarning")
 
 
@@ -138,14 +142,57 @@ def archive(path: Path, data: bytes, *, compression: int = zipfile.ZIP_STORED, *
         (pickle.dumps({}), {"x/data.pkl": b""}, "expected one data.pkl"),
         (pickle.dumps({}), {"byteorder": b"big"}, "big-endian"),
         (pickle.dumps([0] * archives.MAX_PICKLE), {}, "larger than"),
+        (b"(K\x01K\x01" + NESTED + b"K\x01K\x01tQ.", {}, "a storage is named by a tuple"),
     ],
 )
 def test_a_malicious_archive_is_refused_before_room_is_made(
     data: bytes, files: dict[str, bytes], message: str, tmp_path: Path
 ) -> None:
     path = archive(tmp_path / "a.pth", data, **files)
-    found = outcome(lambda: read_checkpoint(path))
-    assert (found.kind, message in found.detail) == ("refused", True), found.detail
+    end = outcome(lambda: read_checkpoint(path))
+    assert (end.kind, message in end.detail) == ("refused", True), end.detail
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"}" + NESTED + b"K\x01s.",
+        b"}(" + NESTED + b"K\x01u.",
+        b"(" + NESTED + b"K\x01d.",
+        b"}X\x01\0\0\0a\x8f(" + NESTED + b"\x90s.",
+        b"}X\x01\0\0\0a(" + NESTED + b"\x91s.",
+        b"ccollections\nOrderedDict\n(](" + NESTED + b"K\x01tatR.",
+    ],
+)
+def test_keys_that_would_take_forever_to_hash_are_left_out(data: bytes, tmp_path: Path) -> None:
+    path = archive(tmp_path / "a.pth", b"\x80\x04" + data)
+    assert outcome(lambda: len(read_checkpoint(path))).kind == "read"
+
+
+def test_counts_and_sets_beside_the_weights_do_not_keep_them_from_being_read(tmp_path: Path) -> None:
+    beside = {"seen": {1, 2}, "counts": collections.defaultdict(int, {"a": 1}), ("a", 1): 2}
+    torch.save({"model": {"w": torch.ones(2)}, **beside}, tmp_path / "a.pth")
+    assert list(read_checkpoint(tmp_path / "a.pth")) == ["w"]
+
+
+def test_weights_of_dtypes_that_torch_stores_untyped_are_read(tmp_path: Path) -> None:
+    weights = {"a": torch.arange(6.0).reshape(2, 3).T.to(torch.float8_e4m3fn), "b": torch.ones(2, dtype=torch.uint16)}
+    torch.save(weights, tmp_path / "a.pth")
+    read = read_checkpoint(tmp_path / "a.pth")
+    assert [(t.dtype, t.float().tolist()) for t in read.values()] == [
+        (t.dtype, t.float().tolist()) for t in weights.values()
+    ]
+
+
+def test_the_format_of_a_file_that_torch_refuses_is_named(tmp_path: Path) -> None:
+    with tarfile.open(tmp_path / "a.pth", "w") as file:
+        for name in ("sys_info", "pickle", "storages", "tensors"):
+            (tmp_path / name).write_bytes(pickle.dumps({}))
+            file.add(tmp_path / name, name)
+    (tmp_path / "b.pth").write_bytes(b"garbage")
+    for name, message in (("a", "it is a tar archive"), ("b", "it is damaged, or no file of torch.save")):
+        with pytest.raises(BadInput, match=message):
+            read_checkpoint(tmp_path / f"{name}.pth")
 
 
 def test_an_archive_that_expands_is_refused(tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ Rules = Mapping[str, Rule]  # by field
 
 LARGEST_WIDTH, MOST_LAYERS, MOST_WEIGHTS = 2**14, 1000, 10**9
 LARGEST_BATCH = 2**20
-"""Bounds that no machine of today would train beyond; room is made only below them."""
+"""Room is made only below these bounds."""
 
 
 def whole(value: int, largest: int) -> Rule:

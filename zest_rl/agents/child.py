@@ -87,16 +87,18 @@ class PolicyProcess:
         self.end()
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (`end` closes it)
         watched, self._held = os.pipe()
-        self._process = subprocess.Popen(
-            [sys.executable, "-I", "-S", "-c", _GUARD, str(watched), *self._words],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            env={**os.environ, **dict.fromkeys(THREAD_VARIABLES, "1")},  # results must not depend on the machine's load
-            start_new_session=True,  # Ctrl-C is for us; we end it
-            pass_fds=[watched],
-        )
-        os.close(watched)
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-I", "-S", "-c", _GUARD, str(watched), *self._words],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                env={**os.environ, **dict.fromkeys(THREAD_VARIABLES, "1")},  # results must not depend on the load
+                start_new_session=True,  # Ctrl-C is for us; we end it
+                pass_fds=[watched],
+            )
+        finally:
+            os.close(watched)
         self._ask({"begin": {"n_episodes": n_episodes, **self._dims}}, "ready")
 
     def __call__(self, obs: FloatArray) -> Any:
@@ -110,16 +112,17 @@ class PolicyProcess:
     def end(self) -> None:
         """Close the process's stdin and wait for it to exit; kill it if it does not."""
         process, self._process = self._process, None
-        if process is None or process.stdin is None or process.stdout is None or self._errors is None:
-            return
-        with suppress(OSError):  # the process may be gone before it read the last line
-            process.stdin.close()
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(GRACE)
-        self._kill()
-        process.wait()
-        process.stdout.close()
-        self._errors.close()
+        if process is not None and process.stdin is not None and process.stdout is not None:
+            with suppress(OSError):  # the process may be gone before it read the last line
+                process.stdin.close()
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(GRACE)
+            self._kill()
+            process.wait()
+            process.stdout.close()
+        self._kill()  # where no process could be started
+        if self._errors is not None:
+            self._errors.close()
 
     def _kill(self) -> None:
         """Let the guard kill the command and whatever it started."""

@@ -69,12 +69,12 @@ def read_archive(path: Path) -> Any:
             return value
         code = f"{root}code/"
         slots = {
-            f"{name.removeprefix(code).removesuffix('.py').replace('/', '.')}.{found[1]}": re.findall(
-                r'"(.*?)"', f"{found[2]}{found[3]}"
+            f"{name.removeprefix(code).removesuffix('.py').replace('/', '.')}.{declared[1]}": re.findall(
+                r'"(.*?)"', f"{declared[2]}{declared[3]}"
             )
             for name in names
             if name.startswith(code) and name.endswith(".py")
-            for found in _SLOTS.finditer(archive.read(name).decode())
+            for declared in _SLOTS.finditer(archive.read(name).decode())
         }
     state = {}
     for count, (prefix, tensors) in enumerate(_modules(value, slots, "")):
@@ -98,6 +98,8 @@ class _Unpickler(pickle._Unpickler):
     """Builds tensors, containers and plain values. In Python, as C's makes room for whatever length a pickle names."""
 
     stack: list[Any]
+    append: Callable[[Any], None]
+    pop_mark: Callable[[], list[Any]]
     dispatch: ClassVar[dict[int, Callable[[Any], None]]] = {
         op: load for op, load in pickle._Unpickler.dispatch.items() if op != pickle.BYTEARRAY8[0]
     }
@@ -109,11 +111,19 @@ class _Unpickler(pickle._Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         """Return what builds objects of a class: never the class."""
         if (module, name) == ("collections", "OrderedDict"):
-            return dict
+            return lambda *_: {}  # its items follow
+        if (module, name) == ("torch.storage", "UntypedStorage"):
+            return torch.uint8
+        if module == "torch" and isinstance(vars(torch).get(name), torch.dtype):
+            return vars(torch)[name]
         if module == "torch" and name in _STORAGES:
             return _STORAGES[name]
         if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
             return lambda storage, offset, size, stride, *_: storage.as_strided(size, stride, offset)
+        if (module, name) == ("torch._utils", "_rebuild_tensor_v3"):  # of newer dtypes, such as float8
+            return lambda storage, offset, size, stride, _, __, dtype, *___: storage.view(dtype).as_strided(
+                size, stride, offset
+            )
         is_wrapper = (module, name) == ("torch._utils", "_rebuild_parameter")
         if is_wrapper or (module == "torch.jit._pickle" and name in _LIST_TAGS):
             return lambda value, *_: value
@@ -122,6 +132,8 @@ class _Unpickler(pickle._Unpickler):
     def persistent_load(self, pid: Any) -> torch.Tensor:
         """Return a storage as one flat tensor."""
         _, dtype, key, _, n = pid
+        if not isinstance(key, str):
+            raise ValueError(f"a storage is named by a {type(key).__name__}")
         if key not in self._storages:
             data = bytearray(self._read(key))
             self._storages[key] = torch.frombuffer(data, dtype=dtype, count=n) if n else torch.empty(0, dtype=dtype)
@@ -133,4 +145,37 @@ class _Unpickler(pickle._Unpickler):
         if isinstance(self.stack[-1], Inert):
             self.stack[-1].state = state
 
-    dispatch[pickle.BUILD[0]] = load_build
+    def load_dict(self) -> None:
+        """Push a dictionary of the items since the mark."""
+        items = self.pop_mark()
+        self.append({})
+        self._put(items)
+
+    def load_setitem(self) -> None:
+        """Put one item into the dictionary below it."""
+        value, key = self.stack.pop(), self.stack.pop()
+        self._put([key, value])
+
+    def load_setitems(self) -> None:
+        """Put the items since the mark into the dictionary below it."""
+        self._put(self.pop_mark())
+
+    def _put(self, items: list[Any]) -> None:
+        """Keep what has a plain key: nested tuples, which name no weights, can take forever to hash."""
+        if isinstance(self.stack[-1], dict):
+            pairs = zip(items[::2], items[1::2], strict=True)
+            self.stack[-1].update((key, value) for key, value in pairs if isinstance(key, str | int))
+
+    def load_additems(self) -> None:
+        """Leave sets empty: they hold no weights, and hash what they hold."""
+        self.pop_mark()
+
+    def load_frozenset(self) -> None:
+        """Push an empty set; see `load_additems`."""
+        self.pop_mark()
+        self.append(frozenset())
+
+    dispatch |= {
+        pickle.BUILD[0]: load_build, pickle.DICT[0]: load_dict, pickle.SETITEM[0]: load_setitem,
+        pickle.SETITEMS[0]: load_setitems, pickle.ADDITEMS[0]: load_additems, pickle.FROZENSET[0]: load_frozenset,
+    }  # fmt: skip

@@ -63,11 +63,15 @@ def reading(path: Path) -> Iterator[None]:
     except ZestError:
         raise
     except Exception as error:
-        reason = " ".join(str(error).split())[:300]
+        reason = " ".join(str(error).split())
         if "weights_only" in reason:  # torch goes on to explain how to let a file run code
-            reason = "it holds objects besides tensors and plain values"
+            reason = (
+                "it holds objects besides tensors and plain values" if "global" in reason.lower()
+                else "it is a tar archive, of torch before 0.4; let torch load and save it again" if ".tar" in reason
+                else "it is damaged, or no file of torch.save"
+            )  # fmt: skip
         raise BadInput(
-            f"{path} cannot be read as the weights of this model ({type(error).__name__}: {reason}); expected "
+            f"{path} cannot be read as the weights of this model ({type(error).__name__}: {reason[:300]}); expected "
             "a .safetensors file or a state dict that torch.save wrote"
         ) from error
 

@@ -14,7 +14,7 @@ from zest_rl.embedders.base import Network
 from zest_rl.errors import BadInput
 from zest_rl.runtime.files import user_path
 
-MOST_LAYERS, LARGEST_SIZE = 1000, 10**7
+MOST_HIDDEN_LAYERS, LARGEST_SIZE = 1000, 10**7
 """Of a model's config; the largest size of one is its vocabulary."""
 
 
@@ -110,7 +110,7 @@ def _check_sizes(config: Any, name: str = "") -> None:
     if isinstance(config, dict | list):
         for key, value in config.items() if isinstance(config, dict) else ((name, item) for item in config):
             _check_sizes(value, str(key))
-    elif isinstance(config, int | float) and config > (MOST_LAYERS if "layers" in name else LARGEST_SIZE):
+    elif isinstance(config, int | float) and config > (MOST_HIDDEN_LAYERS if "layers" in name else LARGEST_SIZE):
         raise ValueError(f"{name} = {config}")
 
 

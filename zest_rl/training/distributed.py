@@ -121,7 +121,7 @@ def local_index() -> int:
     return int(os.environ.get("LOCAL_RANK", 0))
 
 
-def _die_with(parent: int) -> None:
+def _die_with_torchrun(parent: int) -> None:
     """End this process when torchrun is killed: nothing else would end it."""
 
     def watch() -> None:
@@ -139,7 +139,7 @@ def process_group(device: torch.device) -> Iterator[Group]:
     if group.size == 1:
         yield group
         return
-    _die_with(os.getppid())
+    _die_with_torchrun(os.getppid())
     import torch
     import torch.distributed as dist
 
