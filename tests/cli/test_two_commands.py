@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import signal
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from processes import ZEST
 
 from zest_rl.evaluation.evaluate import EvaluationConfig, evaluation_folder
 from zest_rl.runtime import artifacts
 
-CODE = "import sys; from zest_rl.cli import main; sys.exit(main(sys.argv[1:]))"
 PART = "seeds-1000000-1000002"
 TRAIN = ["--hidden-size", "16", "--n-layers", "1", "--n-updates", "4", "--threads", "1", "--device", "cpu"]
 
@@ -31,7 +30,7 @@ def test_the_second_command_waits_says_so_and_does_not_do_the_work_again(
         "export": ([dataset, "--output", str(tmp_path / "out.npz")], tmp_path / "out.npz", ""),
     }[verb]  # fmt: skip
     with artifacts.lock(target):
-        second = subprocess.Popen([sys.executable, "-c", CODE, verb, *words], stderr=subprocess.PIPE, text=True)
+        second = subprocess.Popen([*ZEST, verb, *words], stderr=subprocess.PIPE, text=True)
         assert second.stderr is not None
         waiting = (
             f"waiting for {target.parent}/.{target.name}.lock, which another command holds until {target} is written"
@@ -54,7 +53,7 @@ def test_a_reproduction_waits_for_another_of_the_same_folder_and_can_be_interrup
     recipe = artifacts.shipped("eval") / "demo.toml"
     words = ["reproduce", str(recipe), "--output", str(tmp_path / "demo")]
     with artifacts.lock(tmp_path / "demo"):
-        second = subprocess.Popen([sys.executable, "-c", CODE, *words], stderr=subprocess.PIPE, text=True)
+        second = subprocess.Popen([*ZEST, *words], stderr=subprocess.PIPE, text=True)
         assert second.stderr is not None
         assert f"waiting for {tmp_path}/.demo.lock" in second.stderr.readline()
         second.send_signal(signal.SIGINT)

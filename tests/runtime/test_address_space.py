@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import resource
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from processes import ZEST
 
-ZEST = "import sys; from zest_rl.cli import main; sys.exit(main())"
 GB = 2**30
 
 
@@ -39,7 +38,7 @@ def test_doctor_names_the_limit() -> None:
 
 def run(*words: str, n_bytes: int = GB) -> tuple[int, str]:
     done = subprocess.run(
-        [sys.executable, "-c", ZEST, *words],
+        [*ZEST, *words],
         capture_output=True,
         text=True,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (n_bytes, n_bytes)),
