@@ -77,6 +77,12 @@ def _read_some(read: Callable[[int], Any], inputs: range) -> list[Outcome]:
     return ends
 
 
+def with_memory(n_bytes: int, read: Callable[[], Any]) -> Any:
+    """Call `read` with room for so many bytes more; for a child process, as the limit stays."""
+    resource.setrlimit(resource.RLIMIT_AS, (_held() + n_bytes,) * 2)
+    return read()
+
+
 def _held() -> int:
     """Return the address space of this process in bytes."""
     with open("/proc/self/statm") as file:  # noqa: PTH123

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium
 import pytest
 
-from zest_rl.data.env_specs import check_env_spec, check_registered, entry_points, without_wrappers
-from zest_rl.errors import BadInput
+from zest_rl.data.env_specs import check_env_spec, check_model_files, check_registered, entry_points, without_wrappers
+from zest_rl.errors import BadInput, Notice
 
 
 @pytest.mark.parametrize("name", ["gymnasium.envs.x:Y", "gymnasium_robotics.envs.x:Y", "zest_rl.envs:KitchenEnv"])
@@ -26,7 +28,9 @@ def test_the_code_of_wrappers_counts_too() -> None:
         check_env_spec(json.dumps(spec), "it", "stop")
 
 
-@pytest.mark.parametrize("spec", ["{", "null", "[]", "{}", '{"entry_point": "zest_rl.x", "additional_wrappers": 3}'])
+@pytest.mark.parametrize(
+    "spec", ["{", "null", "[]", "{}", "[" * 100_000, '{"entry_point": "zest_rl.x", "additional_wrappers": 3}']
+)
 def test_what_is_no_env_spec_is_refused(spec: str) -> None:
     with pytest.raises(BadInput, match="it is not the JSON of a Gymnasium EnvSpec"):
         entry_points(spec, "it")
@@ -46,6 +50,21 @@ def test_an_id_stands_for_the_code_that_is_registered_under_it() -> None:
 def test_an_id_of_an_old_version_is_told_with_the_versions_that_are_there() -> None:
     with pytest.raises(BadInput, match=r"CartPole-v9 is not registered .* here, which have CartPole-v0, CartPole-v1; "):
         check_registered(replace(gymnasium.spec("CartPole-v1"), id="CartPole-v9"))
+
+
+@pytest.mark.parametrize("path", ["/dev/zero", "./nowhere.xml", "~/nowhere.xml", "a/../../nowhere.xml"])
+def test_a_model_that_is_no_file_is_refused(path: str) -> None:
+    with pytest.raises(BadInput, match=r"is not a file|does not exist"):
+        check_model_files({"id": "HalfCheetah-v5", "kwargs": {"xml_file": path}})
+
+
+def test_a_model_that_is_a_file_of_yours_is_told_and_one_of_the_package_is_not(tmp_path: Path) -> None:
+    (tmp_path / "own.xml").write_text("<mujoco/>")
+    with pytest.warns(Notice, match=r"HalfCheetah-v5 is made from /.*own\.xml, which the dataset names"):
+        check_model_files({"id": "HalfCheetah-v5", "kwargs": {"xml_file": str(tmp_path / "own.xml")}})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_model_files({"id": "HalfCheetah-v5", "kwargs": {"xml_file": "half_cheetah.xml", "n": 1}})
 
 
 def test_no_wrappers_may_be_written_as_null() -> None:

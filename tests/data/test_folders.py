@@ -59,6 +59,13 @@ def test_a_whole_dataset_may_be_a_link(collected: str, tmp_path: Path) -> None:
     assert reader.list_datasets() == [collected]
 
 
+def test_an_entry_that_cannot_be_read_hides_no_dataset(collected: str) -> None:
+    root = reader.datasets_root()
+    for i in range(30):  # whatever the order of the folder
+        (root / f"wrong-{i}").symlink_to("x" * 300)
+    assert reader.list_datasets() == [collected]
+
+
 @pytest.mark.parametrize(
     "name",
     ["../../dev/zero", "/dev/zero", "../kitchen-micro-tiny-v0/data/metadata.json", "data", "", ".", "\0", "a" * 999],

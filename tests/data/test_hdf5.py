@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from zest_rl.data import reader
-from zest_rl.data.hdf5 import MAX_DEPTH, open_hdf5, read_array
+from zest_rl.data.hdf5 import MAX_DEPTH, MAX_RATIO, open_hdf5, read_array
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.sources import open_source
 
@@ -104,7 +105,7 @@ def test_a_dataset_that_reaches_out_is_refused_by_every_way_to_it_and_nothing_el
     ):
         code, error = refusal(*words)
         assert code == 2
-        assert f"dataset {collected}: " in error
+        assert re.search(f"dataset {collected}: .*{rule}", error), error
     assert [file.read_bytes() for file in beside] == before
     assert reader.list_datasets() == [collected]
     assert not (tmp_path / "x.npz").exists()
@@ -159,6 +160,16 @@ def test_an_array_that_is_declared_but_not_stored_is_refused_before_it_takes_mem
         pytest.raises(BadInput, match=r"huge declares .* of which 0 are stored"),
     ):
         read_array(file["huge"], np.float32)
+
+
+def test_an_array_that_its_filter_shrinks_to_nearly_nothing_is_read(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        entry = file.create_dataset(
+            "zeros", data=np.zeros(2**25, "i4"), chunks=(2**24,), scaleoffset=0, compression="gzip"
+        )
+        assert entry.nbytes > MAX_RATIO * entry.id.get_storage_size()
+    with open_hdf5(tmp_path / "a.hdf5") as file:
+        assert not read_array(file["zeros"], np.int32).any()
 
 
 def test_what_is_no_number_is_refused_and_what_float32_cannot_hold_is_infinite(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzzing import outcome, with_memory
 from PIL import Image, features
 
 from zest_rl.data.images import decode_image, left_out, list_images, read_image
@@ -250,3 +251,9 @@ def test_every_image_of_the_visual_tasks_dataset_is_read(visual_tasks: Path) -> 
         assert frame.dtype == np.uint8
         assert frame.shape[2] == 3
         assert frame.std() > 1, f"{path} came out blank"
+
+
+def test_a_picture_that_does_not_fit_in_memory_is_not_called_damaged(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.png", np.zeros((4000, 4000, 3), np.uint8))
+    end = outcome(lambda: with_memory(2 * 10**7, lambda: read_image(path).shape))
+    assert (end.kind, "a.png needs more memory than there is" in end.detail) == ("refused", True), end

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -132,8 +133,39 @@ def test_the_first_episode_tells_the_range_of_all(group: h5py.Group) -> None:
     with pytest.raises(BadInput, match=r"camera200: pictures of floats must be in \[0, 1\], .* got 200 to 200"):
         read_pictures(bright, slice(None), form_of(dark))
     other = group.create_dataset("other", data=np.zeros((2, 16, 18, 3), "f4"))
-    with pytest.raises(BadInput, match=r"holds float32 \(16, 18, 3\) per step, but the first episode \(16, 16, 3\)"):
+    with pytest.raises(BadInput, match=r"holds float32 \(16, 18, 3\) per step, but the first episode float32 \(16, 16"):
         read_pictures(other, slice(None), form_of(dark))
+
+
+@pytest.mark.parametrize("other", ["uint16", "float32"])
+def test_episodes_of_another_type_are_refused_rather_than_wrapped_or_black(group: h5py.Group, other: str) -> None:
+    first, second = (group.create_dataset(t, data=np.ones((2, 16, 16, 3), t)) for t in ("uint8", other))
+    with pytest.raises(BadInput, match=rf"holds {other} .* but the first episode uint8 \(16, 16, 3\); store all"):
+        read_pictures(second, slice(None), form_of(first))
+
+
+def test_a_dark_episode_has_the_form_of_the_first_and_numbers_have_not(group: h5py.Group) -> None:
+    first, dark, beyond = (group.create_dataset(f"{i}", data=np.full((2, 16, 16, 3), i, "f4")) for i in (200, 30, 300))
+    with pytest.warns(Notice, match="30 counts as 768 numbers per step"):
+        assert is_numbers(dark)
+    assert not is_numbers(dark, form_of(first))
+    with pytest.warns(Notice, match="300 counts as 768 numbers per step"):
+        assert is_numbers(beyond, form_of(first))
+
+
+def test_a_long_episode_of_floats_is_never_in_memory_whole(group: h5py.Group) -> None:
+    entry = group.create_dataset("camera", data=np.ones((640, 64, 64, 3), "f4"), chunks=(8, 64, 64, 3))
+    tracemalloc.start()
+    assert form_of(entry).high == 1
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < entry.nbytes / 4
+
+
+def test_floats_that_are_declared_but_not_stored_are_refused_before_they_are_read(group: h5py.Group) -> None:
+    entry = group.create_dataset("camera", (10**9, 16, 16, 3), "f4", chunks=(10, 16, 16, 3))
+    with pytest.raises(BadInput, match=r"camera declares .* of which 0 are stored"):
+        form_of(entry)
 
 
 def test_numbers_in_the_shape_of_pictures_are_told_and_pixels_are_never_numbers(group: h5py.Group) -> None:
@@ -183,16 +215,17 @@ def test_the_declared_bounds_tell_pictures_from_numbers_whatever_an_episode_hold
         assert numbers(observations).shape == (2, 1 if channels else 101)
 
 
-@pytest.mark.parametrize("value", [1.0, 255.0])
+@pytest.mark.parametrize("value", [1.0, 2.0, 255.0])
 def test_bytes_that_are_declared_but_divided_by_255_are_not_read_as_black(tmp_path: Path, value: float) -> None:
     space = spaces.Dict({"camera": spaces.Box(0, 255, (16, 16, 3), np.float32)})
     storage = MinariStorage.new(tmp_path, observation_space=space, action_space=spaces.Discrete(2))
     one = np.zeros(1)
     pictures = {"camera": np.full((2, 16, 16, 3), value, np.float32)}
+    pictures["camera"][0] = 0  # the first frame is black
     storage.update_episodes([EpisodeBuffer(0, None, None, pictures, one.astype(int), one, one == 1, one == 0, {})])
     with h5py.File(tmp_path / "main_data.hdf5") as file:
         form = form_of(file["episode_0/observations/camera"])
-    assert (form.channels, bool(form.problem)) == ((3, False) if value == 255 else (0, True))
+    assert (form.channels, bool(form.problem)) == ((3, False) if value > 1 else (0, True))
 
 
 @given(st.integers(8, 30), st.integers(8, 30), st.sampled_from([1, 3]), st.booleans())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 import subprocess
@@ -16,11 +17,13 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 import pytest
+from fuzzing import outcome, with_memory
 from lerobot_files import KEY, change_info, change_rows, store_pictures, write_lerobot
 from rollouts import Episode
 
 from zest_rl.errors import BadInput, Notice
 from zest_rl.sources import Source, open_source
+from zest_rl.sources.parquet import MAX_ROWS, read_table
 
 LISTING, DATA = (f"{at}/chunk-000/file-000.parquet" for at in ("meta/episodes", "data"))
 VIDEO = f"videos/{KEY}/chunk-000/file-000.mp4"
@@ -185,7 +188,10 @@ def test_a_picture_in_a_data_file_that_is_none_is_named(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda row: row.update(action=[float("nan"), 0.0]), "action of episode 0 in .*file-000.parquet holds NaN"),
+        (
+            lambda row: row.update(action=[float("nan"), 0.0]),
+            "action of episode 0 in .*file-000.parquet must be finite",
+        ),
         (lambda row: row.update(action=None), "action of episode 0 in .* has no value|must hold numbers"),
         (lambda row: row.update(action=[0.0, None]), "has no value in a list"),
         (lambda row: row.update(action=[0.0] * (1 + row["frame_index"])), "must hold equally long lists"),
@@ -206,6 +212,31 @@ def test_a_column_that_is_not_what_it_should_be_is_named_with_file_and_episode(
     change_rows(root / DATA, change)
     with pytest.raises(BadInput, match=message):
         check(root)
+
+
+def test_a_column_of_other_values_or_with_two_of_its_name_is_refused(root: Path) -> None:
+    table = pyarrow.parquet.read_table(root / DATA)
+    at = table.column_names.index("action")
+    encoded = table.set_column(at, "action", pyarrow.array(["left"] * len(table)).dictionary_encode())
+    double = table.append_column("action", table["action"])
+    empty = table.set_column(at, "action", pyarrow.array([[]] * len(table), pyarrow.list_(pyarrow.float32())))
+    for damaged, message in (
+        (encoded, "must hold numbers or lists of them, got dict"),
+        (double, "has 2 columns 'action'"),
+        (empty, r"must hold equally long lists, of 1 number at least, got lengths \[0\]"),
+    ):
+        pyarrow.parquet.write_table(damaged, root / DATA)
+        with pytest.raises(BadInput, match=message):
+            check(root)
+
+
+def test_a_file_that_does_not_fit_in_memory_is_not_called_damaged(tmp_path: Path) -> None:
+    zeros = pyarrow.chunked_array([np.zeros(10**6)] * 50)
+    pyarrow.parquet.write_table(pyarrow.table({"action": zeros}), tmp_path / "great.parquet")
+    read = functools.partial(read_table, tmp_path / "great.parquet", ["action"], MAX_ROWS)
+    read()  # so that Arrow is loaded
+    end = outcome(lambda: with_memory(10**8, read))
+    assert (end.kind, "great.parquet needs more memory than there is" in end.detail) == ("refused", True), end
 
 
 @pytest.mark.parametrize(

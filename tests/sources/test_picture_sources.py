@@ -168,6 +168,16 @@ def test_an_episode_of_pictures_is_never_in_memory_whole(tmp_path: Path) -> None
     assert peak < n * np.prod(shape) / 4
 
 
+def test_the_same_floats_of_another_range_are_other_pictures(tmp_path: Path) -> None:
+    digests = []
+    for bright in (200, 1):
+        with h5py.File(tmp_path / f"{bright}.hdf5", "w") as file:
+            for i, value in enumerate((bright, 1)):
+                file[f"episode_{i}/observations"] = np.full((2, 16, 16, 3), value, np.float32)
+        digests.append(Pictures(tmp_path / f"{bright}.hdf5", ("episode_0", "episode_1"), ("observations",)).digest(1))
+    assert digests[0] != digests[1]
+
+
 def test_every_way_of_scoring_works_on_pictures(pictured: str, goal: Path, zest: Run) -> None:
     base = ["relabel", pictured, "--goal", goal, "--frames", "cameras/top", "--n-workers", "1"]
     level = zest(*base)["dataset"]

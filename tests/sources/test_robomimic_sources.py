@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from rollouts import LENGTHS, Episode, Run, check_imported, rows, write_robomimi
 
 from zest_rl.errors import BadInput, Notice
 from zest_rl.sources import open_source
+from zest_rl.sources.robomimic import open_robomimic
 
 
 def test_a_robomimic_file_becomes_a_minari_dataset(maze: list[Episode], goal: Path, zest: Run, tmp_path: Path) -> None:
@@ -120,20 +119,27 @@ def test_rewards_may_stand_in_a_column(maze: list[Episode], tmp_path: Path) -> N
         np.testing.assert_array_equal(rewards, expected)
 
 
-def test_demos_of_other_names_are_told_how_to_be_renamed(
-    maze: list[Episode], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = write_robomimic(tmp_path / "lift.hdf5", maze)
+def test_demos_of_other_names_are_refused_without_a_command_that_would_scramble_them(tmp_path: Path) -> None:
+    path = tmp_path / "lift.hdf5"
+    with h5py.File(path, "w") as file:
+        for i in range(12):  # of which traj_10 stands before traj_2
+            file[f"data/traj_{i}/actions"], file[f"data/traj_{i}/obs/object"] = np.ones((i + 1, 2)), np.ones((i + 1, 2))
+    with pytest.raises(BadInput, match=r"named data/demo_0, .*, got data/traj_0 in .* rename them in their order \(h5"):
+        open_robomimic(path, ())
     with h5py.File(path, "r+") as file:
-        for name in list(file["data"]):
-            file["data"].move(name, name.replace("demo", "traj"))
-    with pytest.raises(
-        BadInput, match=r"named data/demo_0, data/demo_1, …, got data/traj_0 in .* rename them: `pyth"
-    ) as told:
-        open_source(str(path))
-    monkeypatch.chdir(tmp_path)
-    subprocess.run(["sh", "-c", str(told.value).split("`")[1].replace("python", sys.executable, 1)], check=True)
-    assert list(open_source(str(path)).trajectories.n_steps) == list(LENGTHS)
+        for i in range(12):
+            file["data"].move(f"traj_{i}", f"demo_{i}")
+    assert list(open_robomimic(path, ())[0].n_steps) == [i + 1 for i in range(12)]
+
+
+def test_a_dark_demo_has_the_pictures_of_the_first(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "lift.hdf5", "w") as file:
+        for i, value in enumerate((200, 30)):
+            for name, shape in (("actions", (3, 2)), ("obs/object", (3, 2)), ("obs/camera", (3, 16, 16, 3))):
+                file[f"data/demo_{i}/{name}"] = np.full(shape, value if name == "obs/camera" else 0, np.float32)
+    source = open_source(str(tmp_path / "lift.hdf5"))
+    assert source.trajectories.fingerprint()
+    assert [frames[0].max() for frames in (next(source.frames.read(i)) for i in range(2))] == [200, 30]
 
 
 def test_a_name_with_two_dots_becomes_an_id(maze: list[Episode], tmp_path: Path) -> None:

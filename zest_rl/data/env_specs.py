@@ -7,9 +7,13 @@ package registers the same code under this id).
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from zest_rl.errors import BadInput
+from zest_rl.errors import BadInput, Notice
+from zest_rl.runtime.files import check_file, user_path
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
@@ -26,7 +30,7 @@ def entry_points(env_spec: str, what: str) -> list[str]:
     try:
         spec = json.loads(env_spec)
         return [str(part["entry_point"]) for part in (spec, *(spec.get("additional_wrappers") or ()))]
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise BadInput(f"{what} is not the JSON of a Gymnasium EnvSpec: {error!r}") from error
 
 
@@ -68,6 +72,19 @@ def check_registered(
             f"{spec.id} would run code of {spec.entry_point!r}, but is registered as {registered.entry_point!r}; "
             f"{instead}"
         )
+
+
+def check_model_files(spec: Mapping[str, Any]) -> None:
+    """Refuse files outside its package that an environment would load and that are none; a `Notice` names the others.
+
+    Raises:
+        BadInput: a device, a pipe, an empty or a missing file.
+    """
+    kwargs = spec.get("kwargs")
+    for value in kwargs.values() if isinstance(kwargs, dict) else ():
+        if isinstance(value, str) and (value.startswith(("/", ".", "~")) or ".." in Path(value).parts):
+            check_file(user_path(value))
+            warnings.warn(f"{spec.get('id')} is made from {value}, which the dataset names", Notice, stacklevel=2)
 
 
 def without_wrappers(env_spec: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from zest_rl.data.hdf5 import check_rows, read_array
 from zest_rl.data.observations import acts_discretely, entries, numbers
+from zest_rl.data.picture_forms import PictureForm
 from zest_rl.errors import BadInput
 from zest_rl.types import FloatArray, check_finite
 
@@ -59,12 +61,12 @@ class EpisodeArrays:
             check_rows(path, entry, self.n_steps, 1)
         return observed
 
-    def observations(self) -> FloatArray:
-        """Read the observations (T+1, obs_dim); a Dict is flattened."""
+    def observations(self, forms: Mapping[str, PictureForm]) -> FloatArray:
+        """Read the observations (T+1, obs_dim); a Dict is flattened. `forms`: of the first episode, see `numbers`."""
         observed = self.observed()
         if list(observed) == ["observations"] and observed["observations"].ndim == 2:
             return read_array(observed["observations"], np.float32)
-        return numbers(self.group["observations"])
+        return numbers(self.group["observations"], forms)
 
     def actions(self, discrete: bool) -> FloatArray:
         """Read the actions (T, act_dim), flattened; whole numbers only if `discrete`."""

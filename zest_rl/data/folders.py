@@ -47,8 +47,11 @@ def _datasets_in(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
     here = folder.resolve()
     if here in above:  # a link that leads back
         return
+    entries = []
     with suppress(OSError):  # no root yet, or a folder of somebody else
-        for entry in folder.iterdir():
+        entries = list(folder.iterdir())
+    for entry in entries:
+        with suppress(OSError):  # for instance a link to a name that is too long
             if entry.name.startswith(".") or not entry.is_dir():
                 continue
             if (entry / METADATA_FILE).exists():

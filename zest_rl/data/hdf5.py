@@ -26,6 +26,10 @@ from zest_rl.runtime.files import check_file
 
 MAX_RATIO = 2000
 """Bytes of an array by bytes that are stored; gzip's limit is 1032."""
+_GREATEST_RATIO = 2**26
+"""The same of other compression: Blosc stores 2 GB of equal values in 32 bytes."""
+_KNOWN_FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32, h5z.FILTER_LZF}
+"""Those to which `MAX_RATIO` applies."""
 MAX_DEPTH = 32
 """Groups within groups; HDF5 walks through them by recursion."""
 _FREE = 64 * 2**20  # bytes of an array that need not be stored, as values that were never written are not
@@ -98,11 +102,17 @@ def check_rows(name: str, node: h5py.Dataset, n_steps: int, n_more: int = 0) -> 
 def check_stored(node: h5py.Dataset) -> None:
     """Raise `BadInput` if an array is larger than what is stored of it can be."""
     n_bytes = math.prod(node.shape or ()) * node.id.get_type().get_size()
-    if n_bytes > _FREE and n_bytes > MAX_RATIO * node.id.get_storage_size():
+    if n_bytes > _FREE and n_bytes > _max_ratio(node) * node.id.get_storage_size():
         raise BadInput(
             f"{node.name} declares {n_bytes:,} bytes of shape {node.shape}, of which {node.id.get_storage_size():,}"
             " are stored; the file is damaged or incomplete, download it or make it again"
         )
+
+
+def _max_ratio(node: h5py.Dataset) -> int:
+    properties = node.id.get_create_plist()
+    filters = {properties.get_filter(i)[0] for i in range(properties.get_nfilters())}
+    return MAX_RATIO if filters <= _KNOWN_FILTERS else _GREATEST_RATIO
 
 
 def _is_raised_by_h5py(error: Exception) -> bool:

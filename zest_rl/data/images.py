@@ -68,6 +68,8 @@ def _decode(file: BinaryIO, what: str) -> Frame:
         except UnidentifiedImageError as error:
             file.seek(0)
             raise BadInput(f"{what} is {_foreign_format(file.read(12))}") from error
+        except MemoryError as error:
+            raise BadInput(f"{what} needs more memory than there is; scale it down, or free some") from error
         except Exception as error:  # on damaged files Pillow raises whatever its parsers stumble over
             raise BadInput(f"{what} is damaged or cut off ({error}); copy or download it again") from error
 

@@ -32,12 +32,13 @@ def entries(node: h5py.Group | h5py.Dataset, prefix: str = "") -> dict[str, h5py
     return datasets
 
 
-def is_numbers(entry: h5py.Dataset) -> bool:
+def is_numbers(entry: h5py.Dataset, first: PictureForm | None = None) -> bool:
     """Whether an entry holds numbers that a policy can observe: no pictures, no text, one row per step.
 
-    A `Notice` names what has the shape of pictures that are not read; unsigned integers of it are left out.
+    A `Notice` names what has the shape of pictures that are not read; unsigned integers of it are left out. `first` is
+    the form of the first episode, see `form_of`.
     """
-    form = form_of(entry)
+    form = form_of(entry, first)
     is_left_out = bool(form.problem) and entry.dtype.kind == "u"
     if form.problem:
         name = re.sub(r"^/(data/)?[^/]*/", "", entry.name)
@@ -109,11 +110,15 @@ def stored_rows(entry: h5py.Dataset) -> Iterator[NDArray[Any]]:
         yield from (entry[row : row + ROWS] for row in range(0, len(entry), ROWS))
 
 
-def numbers(node: h5py.Group | h5py.Dataset) -> FloatArray:
+def numbers(node: h5py.Group | h5py.Dataset, forms: Mapping[str, PictureForm] | None = None) -> FloatArray:
     """Flatten the numbers of an observation: one row per step.
 
     The entries of a Dict are concatenated in the alphabetical order of their paths, as by Gymnasium's ``flatten``;
     pictures and text are left out, and a Discrete stays one number.
+
+    Args:
+        node: the observations of an episode.
+        forms: of the entries of the first episode, by their paths below its node, see `form_of`.
 
     Returns:
         (T+1, n) float32.
@@ -122,7 +127,9 @@ def numbers(node: h5py.Group | h5py.Dataset) -> FloatArray:
         BadInput: there are no numbers.
     """
     columns = [
-        read_array(entry, np.float32).reshape(len(entry), -1) for entry in entries(node).values() if is_numbers(entry)
+        read_array(entry, np.float32).reshape(len(entry), -1)
+        for path, entry in entries(node).items()
+        if is_numbers(entry, (forms or {}).get(path))
     ]
     if not columns:
         raise BadInput(f"{node.name} holds pictures only; a policy here needs numbers to act on")

@@ -5,7 +5,7 @@ and
 
 - uint8 with 1 or 3 channels, or 4 of which the last, the opacity, is 255 everywhere and is dropped;
 - floats with 1 channel in [0, 1], or with 3, or 4 as above, in [0, 1], [0, 255] or [-1, 1]; the range is that of the
-  space where it is finite, else that of all values of the episode;
+  space where it is finite, else that of all values of the first episode;
 - or a JPEG file, which Minari makes of uint8 pictures by default (lossy).
 
 (n, …) of these, up to `MAX_PARTS`, are cameras or stacked frames; each is a picture of its own, ``KEY[i]``.
@@ -23,6 +23,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.data.hdf5 import check_stored
 from zest_rl.data.picture_size import MAX_ASPECT, MAX_PIXELS
 from zest_rl.errors import BadInput
 from zest_rl.types import Frame
@@ -35,7 +36,7 @@ ROWS = 64
 """Steps whose pictures are held in memory at a time."""
 _JPEG = bytes((0xFF, 0xD8, 0xFF))
 _BRIGHT = 64
-"""Floats that are pictures in [0, 255] exceed this somewhere in an episode."""
+"""Floats without bounds that are pictures in [0, 255] exceed this somewhere in an episode."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +57,29 @@ class PictureForm:
     """Of the channels in one picture, -1 or -3; None: (H, W), or a JPEG file."""
     step: tuple[int, ...] = ()
     """Shape of a step; () for JPEG files."""
+    dtype: str = ""
+    """Of the values; "" for JPEG files."""
 
 
-def form_of(entry: h5py.Dataset) -> PictureForm:
-    """Tell whether and how an entry with one row per step holds pictures; floats without bounds are read."""
+def form_of(entry: h5py.Dataset, first: PictureForm | None = None) -> PictureForm:
+    """Tell whether and how an entry with one row per step holds pictures; floats without bounds are read.
+
+    Args:
+        entry: one row per step.
+        first: form of the first episode, which decides where the values fit it: a dark episode alone does not tell its
+            range.
+
+    Raises:
+        BadInput: floats that are declared, but not stored.
+    """
+    form = _form_alone(entry)
+    if form.channels or first is None or (first.dtype, first.step) != (entry.dtype.name, entry.shape[1:]):
+        return form
+    low, high = _extremes(entry)
+    return first if first.channels and first.low <= low and high <= first.high else form
+
+
+def _form_alone(entry: h5py.Dataset) -> PictureForm:
     if _is_jpeg(entry):
         return PictureForm(3)
     step, kind = entry.shape[1:], entry.dtype.kind
@@ -79,11 +99,11 @@ def form_of(entry: h5py.Dataset) -> PictureForm:
     if bounds is None:
         ranges = "[0, 1]" if channels == 1 else "[0, 1], [0, 255] or [-1, 1]"
         return PictureForm(problem=f"{shown}, but not in {ranges} as pictures of floats are")
-    form = PictureForm(1 if channels == 1 else 3, "", *bounds, n_parts, axis, step)
+    form = PictureForm(1 if channels == 1 else 3, "", *bounds, n_parts, axis, step, entry.dtype.name)
     if channels < 4 or _is_opaque(entry[0], form):
         return form
     if axis == -3 and n_parts == 0 and kind == "u":
-        return PictureForm(1, "", *bounds, 4, None, step)
+        return PictureForm(1, "", *bounds, 4, None, step, entry.dtype.name)
     return PictureForm(problem=f"{shown}, of which the fourth channel is not opaque: depth, or stacked frames")
 
 
@@ -112,8 +132,7 @@ def _float_range(entry: h5py.Dataset, *, is_grey: bool) -> tuple[float, float] |
     if not is_declared:
         if np.isfinite([low, high]).any():
             return None
-        parts = [entry[row : row + ROWS] for row in range(0, len(entry), ROWS)]
-        low, high = float(min(part.min() for part in parts)), float(max(part.max() for part in parts))
+        low, high = _extremes(entry)
     if low >= 0 and high <= 1:  # NaN is not
         return 0.0, 1.0
     if is_grey:
@@ -121,8 +140,18 @@ def _float_range(entry: h5py.Dataset, *, is_grey: bool) -> tuple[float, float] |
     if low >= -1 and high <= 1:
         return -1.0, 1.0
     if is_declared and (low, high) == (0.0, 255.0):
-        high = float(entry[0].max())  # some declare bytes, but divide by 255
+        return (0.0, 255.0) if _extremes(entry)[1] > 1 else None  # some declare bytes, but divide by 255
     return (0.0, 255.0) if low >= 0 and _BRIGHT <= high <= 255 else None
+
+
+def _extremes(entry: h5py.Dataset) -> tuple[float, float]:
+    """Return the least and the greatest value, NaN if any is."""
+    check_stored(entry)
+    low, high = np.inf, -np.inf
+    for row in range(0, len(entry), ROWS):
+        part = entry[row : row + ROWS]
+        low, high = np.minimum(low, part.min()), np.maximum(high, part.max())
+    return float(low), float(high)
 
 
 def _declared_bounds(entry: h5py.Dataset) -> tuple[float, float]:
@@ -176,10 +205,10 @@ def read_pictures(
 
         first = rows.indices(len(entry))[0]
         return [decode_image(bytes(row), f"{entry.name} at step {first + i}") for i, row in enumerate(entry[rows])]
-    if entry.shape[1:] != form.step or entry.dtype.kind not in "uf":
+    if (entry.dtype.name, entry.shape[1:]) != (form.dtype, form.step):
         raise BadInput(
             f"{entry.name} holds {entry.dtype} {entry.shape[1:]} per step, but the first episode "
-            f"{form.step or 'JPEG files'}; store all episodes alike"
+            f"{f'{form.dtype} {form.step}' if form.step else 'JPEG files'}; store all episodes alike"
         )
     stored = entry[rows] if part is None else entry[rows, part]
     return [_to_frame(picture, form, entry.name) for picture in stored]

@@ -38,7 +38,8 @@ from zest_rl.data.folders import datasets_root as datasets_root
 from zest_rl.data.folders import exists as exists
 from zest_rl.data.folders import list_datasets as list_datasets
 from zest_rl.data.hdf5 import mapped_errors, open_hdf5, read_array
-from zest_rl.data.observations import is_numbers, stored_rows
+from zest_rl.data.observations import entries, is_numbers, joined, stored_rows
+from zest_rl.data.picture_forms import PictureForm, form_of
 from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
@@ -95,7 +96,7 @@ class Dataset:
 
         def read(arrays: EpisodeArrays) -> Episode:
             return Episode(
-                obs=arrays.observations(),
+                obs=arrays.observations(self._forms),
                 actions=arrays.actions(discrete),
                 rewards=arrays.read("rewards"),
                 terminated=arrays.is_terminated(),
@@ -201,11 +202,12 @@ class Dataset:
 
         def digest(arrays: EpisodeArrays) -> str:
             observed = arrays.observed()
-            numeric = {path: entry for path, entry in observed.items() if is_numbers(entry)}
+            forms = {joined("observations", path): form for path, form in self._forms.items()}
+            numeric = {path: entry for path, entry in observed.items() if is_numbers(entry, forms.get(path))}
             rest = [arrays.read("actions", ndim=None), np.array([arrays.is_terminated()])]
             widths.append({"actions": rest[0].shape[1:], **{path: numeric[path].shape[1:] for path in numeric}})
             if _QPOS in arrays.group:
-                rest.append(read_array(arrays.group[_QPOS], np.float64))
+                rest.append(arrays.read(_QPOS, np.float64, n_more=1, ndim=None))
             parts = (
                 [check_finite(path, read_array(entry, np.float32))] if path in numeric else stored_rows(entry)
                 for path, entry in observed.items()
@@ -257,6 +259,12 @@ class Dataset:
                 "docs/any_dataset.md"
             )
         return self.record.task
+
+    @cached_property
+    def _forms(self) -> dict[str, PictureForm]:
+        """Forms of the observations of the first episode, by their paths below ``observations``."""
+        observations = next(iter(self.groups.values())).get("observations")
+        return {} if observations is None else {path: form_of(entry) for path, entry in entries(observations).items()}
 
     def _each(self, read: Callable[[EpisodeArrays], Any]) -> list[Any]:
         results = []

@@ -66,7 +66,7 @@ def iter_frames(path: Path, start: float = 0.0, n_frames: int | None = None) -> 
 
 
 def frame_times(path: Path) -> NDArray[np.float64]:
-    """Return when each frame of a video file is shown: (n,) seconds after its first one; nothing is decoded.
+    """Return when each frame of a video file is shown: (n,) seconds, as ffmpeg gives them; nothing is decoded.
 
     Raises:
         BadInput: no video, or damaged.

@@ -1,4 +1,4 @@
-"""HDF5 files that are proven whole: h5py drops the error of a write that fails while an array is closed."""
+"""HDF5 files that are compared with what was to be written: h5py drops errors of writes while an array is closed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def write_hdf5(
         compression: of all arrays.
 
     Raises:
-        ZestError: an array did not reach the disk.
+        ZestError: an array in the file is another one.
     """
     with h5py.File(path, "w") as file:
         for name, values in arrays.items():

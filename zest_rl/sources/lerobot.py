@@ -34,7 +34,7 @@ from zest_rl.sources.conversion import ConvertedEpisode, ConvertedTrajectories
 from zest_rl.sources.lerobot_meta import INFO, OTHERS, Info, complete_episodes, read_listing
 from zest_rl.sources.parquet import MAX_ROWS, as_numbers, open_parquet, read_table
 from zest_rl.sources.parquet_pictures import ParquetPictures
-from zest_rl.types import FloatArray, Frame
+from zest_rl.types import FloatArray, Frame, check_finite
 
 
 def read_episodes(
@@ -63,12 +63,8 @@ def read_episodes(
                 )
             read = {name: as_numbers(rows[column], f"{column} of {where}") for name, column in columns.items()}
             for name, values in read.items():
-                finite = np.isfinite(values).all(axis=1)
-                if not (finite.all() or name == "next.reward"):
-                    raise BadInput(
-                        f"{columns[name]} of {where} holds NaN or infinity at step {np.argmin(finite)}; repair or "
-                        "leave out the episode"
-                    )
+                if name != "next.reward":
+                    check_finite(f"{columns[name]} of {where}", values)
                 if values.shape[1] != widths.setdefault(name, values.shape[1]):
                     raise BadInput(
                         f"{columns[name]} of {where} holds {values.shape[1]} numbers per step, but {widths[name]} in "

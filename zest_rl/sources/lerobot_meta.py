@@ -81,16 +81,7 @@ class Info:
                 facts["dtype"], facts["shape"] = str(facts["dtype"]), [int(n) for n in facts["shape"]]
         except BadInput:
             raise
-        except (
-            ZestError,
-            AttributeError,
-            KeyError,
-            TypeError,
-            ValueError,
-            OverflowError,
-            RecursionError,
-            MemoryError,
-        ) as error:
+        except _WRONG as error:
             raise BadInput(
                 f"{root}/meta is not that of a LeRobot v3.0 dataset ({error} in info.json); download it again"
             ) from error

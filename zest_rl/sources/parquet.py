@@ -29,7 +29,8 @@ def open_parquet(path: Path, max_rows: int) -> Iterator[Any]:
         A `pyarrow.parquet.ParquetFile`.
 
     Raises:
-        BadInput: the file is missing, damaged, a Git LFS pointer or too long; pyarrow is not installed.
+        BadInput: the file is missing, damaged, a Git LFS pointer, too long or larger than memory; or pyarrow is not
+            installed.
     """
     try:
         import pyarrow.parquet
@@ -45,6 +46,8 @@ def open_parquet(path: Path, max_rows: int) -> Iterator[Any]:
             yield opened
     except BadInput:
         raise
+    except MemoryError as error:
+        raise BadInput(f"{path} needs more memory than there is ({error}); free some") from error
     except Exception as error:  # on damaged files Arrow raises many kinds
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise BadInput(f"{path} cannot be read as parquet ({reason}); download it again") from error
@@ -54,12 +57,16 @@ def read_table(path: Path, columns: Sequence[str], max_rows: int) -> Any:
     """Read columns as a `pyarrow.Table`; arguments and errors as in `open_parquet`.
 
     Raises:
-        BadInput: also if the file lacks a column.
+        BadInput: also if the file lacks a column, or has two of a name.
     """
     with open_parquet(path, max_rows) as file:
         names = file.schema_arrow.names
         if missing := [name for name in columns if name not in names]:
             raise BadInput(f"{path} has no column {missing[0]!r}, got {', '.join(names)[:300]}; download it again")
+        if double := [name for name in columns if names.count(name) > 1]:
+            raise BadInput(
+                f"{path} has {names.count(double[0])} columns {double[0]!r}; leave one, or download it again"
+            )
         return file.read(columns=list(columns))
 
 
@@ -73,7 +80,8 @@ def as_numbers(values: Any, what: str) -> FloatArray:
     import pyarrow.types
 
     array: Any = values.combine_chunks()
-    flat = array.flatten() if hasattr(array.type, "value_type") else array
+    is_list = (pyarrow.types.is_list, pyarrow.types.is_large_list, pyarrow.types.is_fixed_size_list)
+    flat = array.flatten() if any(known(array.type) for known in is_list) else array
     is_number = (pyarrow.types.is_integer, pyarrow.types.is_floating, pyarrow.types.is_boolean)
     if not any(known(flat.type) for known in is_number):
         raise BadInput(f"{what} must hold numbers or lists of them, got {array.type}; leave it out of info.json")
@@ -81,6 +89,7 @@ def as_numbers(values: Any, what: str) -> FloatArray:
         row = pyarrow.compute.index(pyarrow.compute.is_null(array), True).as_py()
         at = f"at step {row}" if array.null_count else "in a list"
         raise BadInput(f"{what} has no value {at}; fill it, or leave out the episode")
-    if flat is not array and len(lengths := pyarrow.compute.list_value_length(array).unique()) > 1:
-        raise BadInput(f"{what} must hold equally long lists, got lengths {sorted(lengths.to_pylist())[:5]}")
+    lengths = [1] if flat is array else pyarrow.compute.list_value_length(array).unique().to_pylist()
+    if lengths == [0] or len(lengths) > 1:
+        raise BadInput(f"{what} must hold equally long lists, of 1 number at least, got lengths {sorted(lengths)[:5]}")
     return np.asarray(flat.to_numpy(zero_copy_only=False), np.float32).reshape(len(array), -1)

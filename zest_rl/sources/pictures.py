@@ -35,7 +35,7 @@ class Pictures:
         return {"kind": "pictures", "views": list(self.views), "last_frame_from": list(self.lasts)}
 
     def digest(self, episode: int) -> str:
-        """Hash the stored rows, and what is black and white where black is not 0."""
+        """Hash the stored rows, and what is black and white of floats that are not in [0, 1]."""
         with open_hdf5(self.file) as file:
             group = file[self.episodes[episode]]
 
@@ -47,7 +47,9 @@ class Pictures:
 
             views = (block for view in self.views for block in stored(view))
             lasts = (block for last in self.lasts for block in stored(last, is_last=True))
-            ranges = [(form.low, form.high) for form in self._forms() if form.low < 0]
+            ranges = [
+                (f.low, f.high) for f in self._forms() if f.dtype.startswith("float") and (f.low, f.high) != (0, 1)
+            ]
             return artifacts.hash_json([*(artifacts.hash_stream(rows) for rows in (views, lasts)), *ranges])
 
     def read(self, episode: int) -> Iterator[Sequence[Frame]]:

@@ -8,7 +8,7 @@ its ``terminals`` is 1, which `zest export` records; without these, of its ``don
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ import numpy as np
 
 from zest_rl.data.hdf5 import check_rows, mapped_errors, open_hdf5, read_array
 from zest_rl.data.observations import choose_pictures, entries, is_numbers
+from zest_rl.data.picture_forms import PictureForm, form_of
 from zest_rl.errors import BadInput, Notice
 from zest_rl.sources.conversion import ConvertedEpisode, ConvertedTrajectories
 from zest_rl.sources.pictures import Pictures, picture_entries, split_part
@@ -32,9 +33,11 @@ def read_episodes(path: Path, names: Sequence[str]) -> Iterator[ConvertedEpisode
     """
     first: dict[str, int] = {}
     with open_hdf5(path) as file:
+        with _named(names[0], path):
+            forms = {key: form_of(entry) for key, entry in entries(file[names[0]]["obs"], "obs").items()}
         for name in names:
             with _named(name, path):
-                episode = _read(file[name])
+                episode = _read(file[name], forms)
                 widths = {
                     **{f"obs/{key}": v.shape[1] for key, v in episode.obs.items()},
                     "actions": episode.actions.shape[1],
@@ -66,9 +69,8 @@ def _demos(file: h5py.File, path: Path) -> list[str]:
     demos = [name for name in members if name.startswith("demo_")]
     if misnamed := [name for name in demos or members if not name.removeprefix("demo_").isdecimal()]:
         raise BadInput(
-            f"episodes must be named data/demo_0, data/demo_1, …, got data/{misnamed[0]} in {path}; rename them: "
-            f"""`python -c "import h5py; d = h5py.File('{path.name}', 'r+')['data']; """
-            """[d.move(name, f'demo_{i}') for i, name in enumerate(list(d))]"`"""
+            f"episodes must be named data/demo_0, data/demo_1, …, got data/{misnamed[0]} in {path}; rename them in "
+            "their order (h5py: `file.move(OLD, NEW)`)"
         )
     names = [f"data/{name}" for name in sorted(demos, key=lambda name: int(name.removeprefix("demo_")))]
     lengths = {name: _length(file[name]) for name in names}
@@ -112,13 +114,13 @@ def _arrays(demo: h5py.Group) -> dict[str, h5py.Dataset]:
     return arrays
 
 
-def _read(demo: h5py.Group) -> ConvertedEpisode:
+def _read(demo: h5py.Group, forms: Mapping[str, PictureForm]) -> ConvertedEpisode:
     arrays = _arrays(demo)
     actions = read_array(arrays["actions"], np.float32)
     rewards = read_array(arrays["rewards"], np.float32) if "rewards" in arrays else np.full(len(actions), np.nan, "f4")
     obs = {}
     for path, entry in arrays.items():
-        if path.startswith("obs") and is_numbers(entry):
+        if path.startswith("obs") and is_numbers(entry, forms.get(path)):
             rows: FloatArray = read_array(entry, np.float32).reshape(len(entry), -1)
             after = arrays.get(f"next_{path}")
             last = rows[-1:] if after is None else read_array(after, np.float32)[-1:].reshape(1, -1)

@@ -18,7 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from zest_rl.data.env_specs import check_env_spec, without_wrappers
+from zest_rl.data.env_specs import check_env_spec, check_model_files, without_wrappers
 from zest_rl.data.hdf5 import check_rows, open_hdf5, read_array
 from zest_rl.data.observations import entries
 from zest_rl.errors import BadInput, ZestError
@@ -122,7 +122,7 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
         what: names the dataset in an error.
 
     Raises:
-        BadInput: no state, several, or one that does not fit the model; no such camera.
+        BadInput: no state, several, or one that does not fit the model; no such camera; a model that is no file.
         ZestError: the environment cannot be made here.
     """
     if env_spec is None:
@@ -135,6 +135,7 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
     if plugin is None:
         code = without_wrappers(env_spec)
         check_env_spec(code, f"the env_spec of {what}", "give --frames FOLDER with a video of each episode")
+    check_model_files(spec)
     row = recorded_env(str(spec["entry_point"]))
     with open_hdf5(file) as opened:
         group = opened[episodes[0]]
