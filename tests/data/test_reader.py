@@ -12,8 +12,10 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
+from minari_files import Recorded, write_minari
 from read_dataset import read
 
 from zest_rl.data import reader
@@ -236,6 +238,38 @@ def test_a_broken_recorded_state_is_named(
     replace_array(collected, "episode_1/infos/state/qpos", change)
     with pytest.raises(BadInput, match=rf"episode_1 of dataset {collected}: infos/state/{rule}"):
         read(collected, Dataset.states)
+
+
+@pytest.mark.parametrize(
+    ("state", "rule"),
+    [
+        (np.full((101, 30), np.nan), "qpos must be finite"),
+        (np.zeros((100, 30)), r"qpos must have T \+ 1 = 101 rows"),
+        ({"left": np.zeros((101, 30))}, "qpos' in /episode_1 must be one flat array, got a group"),
+    ],
+)
+def test_a_fingerprint_takes_no_broken_state(collected: str, state: Any, rule: str) -> None:
+    with edited(collected) as file:
+        del file["episode_1/infos/state/qpos"]
+        for name, values in state.items() if isinstance(state, dict) else [("", state)]:
+            file[f"episode_1/infos/state/qpos/{name}".rstrip("/")] = values
+    with pytest.raises(BadInput, match=rf"episode_1 of dataset {collected}: '?infos/state/{rule}"):
+        read(collected, Dataset.fingerprint)
+
+
+def test_a_dark_episode_of_pictures_is_read_in_the_form_of_the_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    box = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+    space = spaces.Dict({"arm": box, "camera": spaces.Box(-np.inf, np.inf, (16, 16, 3), np.float32)})
+    recorded = [
+        Recorded({"arm": np.zeros((3, 3), "f4"), "camera": np.full((3, 16, 16, 3), bright, "f4")}, actions, np.zeros(2))
+        for bright, actions in ((200, np.zeros((2, 3), "f4")), (30, np.zeros((2, 3), "f4")))
+    ]
+    write_minari("some/dark-v0", recorded, space, box)
+    assert [episode.obs.shape for episode in read("some/dark-v0", Dataset.episodes)] == [(3, 3)] * 2
+    assert read("some/dark-v0", Dataset.fingerprint)
 
 
 def test_an_episode_without_steps_is_refused(collected: str) -> None:
