@@ -68,7 +68,7 @@ def _read_some(read: Callable[[int], Any], inputs: range) -> list[Outcome]:
             os._exit(0)
     os.close(sink)
     with os.fdopen(source, "rb") as pipe:
-        ends = [Outcome(*json.loads(line)) for line in pipe]
+        ends = [Outcome(*json.loads(line)) for line in pipe if line.endswith(b"\n")]  # a kill may cut the last
     _, status = os.waitpid(child, 0)
     if len(ends) < len(inputs):
         killed = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0

@@ -35,6 +35,12 @@ PICTURES: dict[str, Any] = {
 }  # fmt: skip
 
 
+def with_views(**changes: Any) -> dict[str, Any]:
+    config: Any = SCORER["config"]
+    scorer = {**SCORER, "config": {**config, "views": {**config["views"], **changes}}}
+    return {"zest": {"relabel": {**KITCHEN, "scorer": scorer}}}
+
+
 @pytest.mark.parametrize("values", [KITCHEN, PICTURES], ids=["kitchen", "pictures"])
 @pytest.mark.parametrize("of_run", [False, True])
 def test_a_record_becomes_the_json_that_it_was_read_from(values: dict[str, Any], of_run: bool) -> None:
@@ -99,6 +105,9 @@ def test_a_record_of_another_program_is_named_with_its_dataset(relabel: Any) -> 
         ({"zest": {"recorded": {"fps": "10"}}}, "fps must be float | None, got '10'"),
         ({"zest": {"recorded": 10}}, "TypeError"),
         ({"zest": {"relabel": {**KITCHEN, "source": 1}}}, "source must be str, got 1"),
+        (with_views(task=3), "task must be str, got 3"),
+        (with_views(n_views="8"), "n_views must be int, got '8'"),
+        (with_views(more=1), "unexpected keyword argument 'more'"),
         ({"zest": {"relabel": {**KITCHEN, "reward": "both"}}}, "reward must be Literal"),
         ({"zest": {"relabel": {**KITCHEN, "kept_goals": [0.5]}}}, "kept_goals must be tuple"),
         ({"zest": {"relabel": {**KITCHEN, "shuffle": True}}}, "shuffle must be int | None, got True"),

@@ -179,10 +179,8 @@ def test_a_killed_command_goes_on_where_it_stopped_and_ends_with_the_same_datase
     tmp_path: Path, uncut: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     command = start()
-    deadline = time.monotonic() + 120
     while not parts(tmp_path / "cache"):
         assert command.poll() is None
-        assert time.monotonic() < deadline
         time.sleep(0.02)
     command.send_signal(signal.SIGKILL)
     command.communicate()

@@ -19,6 +19,7 @@ from zest_rl.kitchen.views import Views
 from zest_rl.rewards.frame_embeddings import FrameEmbeddings
 from zest_rl.rewards.state_embeddings import StateEmbedder, StateEmbeddings
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.arrays import write_arrays
 from zest_rl.sources import Source, open_source
 from zest_rl.sources.kitchen import KitchenStates, kitchen_source
 from zest_rl.sources.videos import EpisodeVideos
@@ -140,6 +141,20 @@ def test_whole_files_with_other_numbers_are_refused_and_nothing_is_deleted(sourc
 
 def test_a_cached_episode_costs_no_more_than_the_frames_that_are_compared(source: Source, tmp_path: Path) -> None:
     filled(source, tmp_path / "cache")
-    again = embeddings_of(source)
+    again, state = embeddings_of(source), random.getstate()
     again.embed()
     assert again.n_embedded == 0
+    assert random.getstate() == state, "the caller's random numbers are left alone"
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 1280), (4, 1, 1280)], ids=["views", "steps"])
+def test_a_file_of_other_views_or_steps_is_damage_and_not_the_dataset_s_fault(
+    shape: tuple[int, ...], source: Source, tmp_path: Path
+) -> None:
+    expected, files = filled(source, tmp_path / "cache")
+    for path in files:
+        write_arrays(path, {"embeddings": np.ones(shape, np.float32)})
+    again = embeddings_of(source)
+    again.embed()
+    for episode, embeddings in zip(again, expected, strict=True):
+        np.testing.assert_array_equal(episode.embeddings, embeddings)

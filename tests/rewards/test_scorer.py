@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import random
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import open_clip
 import pytest
 import safetensors.numpy
 import torch
+from fuzzing import damaged_json, faults, outcomes
 from read_dataset import read
 
 from zest_rl.data.reader import Dataset
@@ -254,6 +256,36 @@ def test_a_missing_or_damaged_scorer_is_an_error_that_says_what_to_do(scorer: St
     rewrite(path, colour="blue")
     with pytest.raises(ZestError, match=expected):
         Scorer.load(path)
+
+
+def test_a_scorer_whose_goals_are_of_another_length_than_its_embeddings_is_refused(
+    scorer: StateScorer, tmp_path: Path
+) -> None:
+    short = replace(scorer.scorer, starts=scorer.scorer.starts[..., :7], goals=scorer.scorer.goals[..., :7])
+    short.save(tmp_path / "scorer.safetensors")
+    with pytest.raises(
+        BadInput, match=r"holds embeddings of 7 numbers, but its embedder efficientnet-lite0 makes 1280"
+    ):
+        Scorer.load(tmp_path / "scorer.safetensors")
+
+
+@pytest.mark.parametrize("n_inputs", [100, pytest.param(3000, marks=pytest.mark.slow)])
+def test_a_scorer_of_a_damaged_description_is_loaded_or_refused(
+    n_inputs: int, scorer: StateScorer, tmp_path: Path
+) -> None:
+    path, rng = tmp_path / "scorer.safetensors", random.Random(0)
+    scorer.scorer.save(path)
+    arrays, described = safetensors.numpy.load_file(path), scorer.scorer.record.to_json()
+    damaged = [damaged_json(described, rng) for _ in range(n_inputs)]
+    damaged.append({**described, "config": {**described["config"], "precision": []}})
+
+    def load(i: int) -> None:
+        safetensors.numpy.save_file(arrays, path, metadata={"scorer": json.dumps(damaged[i])})
+        Scorer.load(path)
+
+    kinds, wrong = faults(outcomes(load, len(damaged)))
+    assert not wrong, wrong[0].detail
+    assert kinds["refused"] > n_inputs / 2
 
 
 # --- goals without ground truth ---

@@ -125,11 +125,14 @@ def test_a_reader_beside_two_writers_sees_whole_files_only(tmp_path: Path) -> No
     for writer in writers:
         writer.start()
     seen = set()
-    while any(writer.is_alive() for writer in writers):
+    alive = True
+    while alive:
+        alive = any(writer.is_alive() for writer in writers)
         got = read_arrays(path)
         assert got is not None
         seen.add(tuple(np.unique(got["values"])))
     assert [writer.exitcode for writer in writers] == [0, 0]
+    assert seen
     assert seen <= {(1,), (2,)}
     assert [file.name for file in tmp_path.iterdir()] == ["part.npz"]
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import re
 import signal
 import subprocess
@@ -143,8 +144,36 @@ def test_what_a_process_of_another_machine_left_is_removed_after_a_day(tmp_path:
     artifacts.write_bytes(tmp_path / "b.bin", b"")
     assert elsewhere.exists(), "nobody here knows whether that process is alive"
     os.utime(elsewhere, (0, 0))
+    artifacts._remove_stale.cache_clear()  # as in another process
     artifacts.write_bytes(tmp_path / "b.bin", b"")
     assert names(tmp_path) == {"b.bin"}
+
+
+def test_a_file_of_another_machine_that_is_renamed_at_the_same_time_is_no_error(tmp_path: Path) -> None:
+    renamed = tmp_path / ".a.bin.0123abcd-7-0123abcd.tmp"
+    renamed.touch()
+    (entry,) = os.scandir(tmp_path)
+    renamed.unlink()
+    assert not artifacts._is_stale(entry)
+
+
+def test_a_name_with_a_number_that_no_process_has_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / f".a.bin.{artifacts._machine()}-{10**30}-0123abcd.tmp").touch()
+    artifacts.write_bytes(tmp_path / "b.bin", b"")
+    assert len(names(tmp_path)) == 2
+
+
+def test_machines_of_one_name_are_told_apart() -> None:
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text()
+    namespace = str(Path("/proc/self/ns/pid").readlink())
+    assert artifacts._machine() == artifacts.hash_json([platform.node(), namespace, boot])[:8]
+
+
+def test_a_folder_is_scanned_once_by_a_process_however_many_files_it_writes(tmp_path: Path) -> None:
+    artifacts._remove_stale.cache_clear()
+    for i in range(5):
+        artifacts.write_bytes(tmp_path / f"{i}.bin", b"")
+    assert artifacts._remove_stale.cache_info()[:2] == (4, 1)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from zest_rl.errors import ZestError
+from zest_rl.errors import Notice, ZestError
 from zest_rl.runtime.cache import cache_folder, check_private
 
 
@@ -26,16 +26,27 @@ def test_a_cache_is_made_for_its_owner_alone_whatever_the_umask(root: Path, umas
 
 
 @pytest.mark.parametrize("below", ["", "frames", "frames/abc"])
-@pytest.mark.parametrize("mode", [0o777, 0o775, 0o702])
-def test_a_cache_that_others_can_write_to_is_refused_with_what_to_type(root: Path, below: str, mode: int) -> None:
+@pytest.mark.parametrize("mode", [0o777, 0o702])
+def test_a_cache_that_everybody_can_write_to_is_refused_with_what_to_type(root: Path, below: str, mode: int) -> None:
     cache_folder("frames", "abc")
     (root / below).chmod(mode)
     with pytest.raises(
-        ZestError, match=rf"others can write to the cache .* \(mode {mode:o}\).*: chmod -R go-w {root / below}"
+        ZestError, match=rf"everybody can write to the cache .* \(mode {mode:o}\).*: chmod -R go-w {root / below}"
     ):
         cache_folder("frames", "abc")
     (root / below).chmod(mode & 0o755)
     cache_folder("frames", "abc")
+
+
+def test_a_cache_that_its_group_could_write_to_becomes_this_user_s_alone_and_one_notice_says_so(root: Path) -> None:
+    cache_folder("frames", "abc")
+    folders = [root, root / "frames", root / "frames/abc"]
+    for folder in folders:
+        folder.chmod(0o775)
+    with pytest.warns(Notice, match=rf"the cache {root}, which its group could write to, is yours alone now") as told:
+        cache_folder("frames", "abc")
+    assert len(told) == 1
+    assert [folder.stat().st_mode & 0o777 for folder in folders] == [0o700] * 3
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder away")

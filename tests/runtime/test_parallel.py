@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -14,7 +15,18 @@ import pytest
 
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime.arrays import Arrays, read_arrays
-from zest_rl.runtime.parallel import Engine, cached_jobs, chunks, n_cores, one_thread, run_jobs
+from zest_rl.runtime.parallel import (
+    MAX_ACTORS,
+    WORKERS_PER_CORE,
+    Engine,
+    cached_jobs,
+    chunks,
+    n_cores,
+    one_thread,
+    prepare_child,
+    run_jobs,
+    starting_children,
+)
 
 # --- work that is sent to other processes -----------------------------------------------------------------------------
 
@@ -45,6 +57,11 @@ def be_killed_after_the_first(parent: int, folder: Path, seed: int) -> Arrays:
 
 def be_ended_by(number: int, seed: int) -> None:
     os.kill(os.getpid(), number)
+
+
+def wait_to_be_ended() -> None:
+    prepare_child()
+    time.sleep(600)
 
 
 def wait_for_two(folder: Path) -> Arrays:
@@ -199,7 +216,12 @@ def test_a_killed_worker_is_a_clear_error_and_finished_parts_are_kept(tmp_path: 
 
 @pytest.mark.parametrize(
     ("number", "cause"),
-    [(signal.SIGSEGV, "SIGSEGV: a native library crashed"), (signal.SIGKILL, "SIGKILL: killed, or out of memory")],
+    [
+        (signal.SIGSEGV, "SIGSEGV: a native library crashed"),
+        (signal.SIGKILL, "SIGKILL: killed, or out of memory"),
+        (signal.SIGTERM, "SIGTERM: killed, or out of memory"),
+        (signal.SIGRTMIN + 1, rf"signal {signal.SIGRTMIN + 1}: killed"),
+    ],
 )
 def test_the_message_of_a_dead_worker_names_stage_and_signal(number: int, cause: str) -> None:
     with pytest.raises(ZestError, match=rf"a worker process died in drawing before .* \({cause}"):
@@ -209,8 +231,34 @@ def test_the_message_of_a_dead_worker_names_stage_and_signal(number: int, cause:
 @pytest.mark.parametrize("n_workers", [0, -1, 100_000, 10**14])
 @pytest.mark.parametrize("engine", ["local", "ray"])
 def test_more_workers_than_any_machine_has_are_refused_before_one_is_started(n_workers: int, engine: Engine) -> None:
+    jobs = {str(seed): seed for seed in range(max(MAX_ACTORS, WORKERS_PER_CORE * n_cores()) + 1)}
     with pytest.raises(BadInput, match=rf"workers must be between 1 and \d+ here, got {n_workers}; leave it out"):
-        list(run_jobs(draw, SEEDS, n_workers=n_workers, engine=engine))
+        list(run_jobs(draw, jobs, n_workers=n_workers, engine=engine))
+
+
+def test_more_workers_than_the_cores_could_bear_are_as_many_as_there_are_jobs() -> None:
+    assert [name for name, _ in run_jobs(draw, {"part-0": 0}, n_workers=100_000)] == ["part-0"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_waits_until_the_child_that_is_being_started_is_known(number: signal.Signals) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before, child = (
+        signal.signal(number, interrupt),
+        multiprocessing.get_context("spawn").Process(target=wait_to_be_ended),
+    )
+    try:
+        with pytest.raises(KeyboardInterrupt), starting_children():  # noqa: PT012
+            os.kill(os.getpid(), number)
+            child.start()
+    finally:
+        signal.signal(number, before)
+    assert child.pid is not None
+    child.terminate()
+    child.join()
+    assert child.exitcode == -signal.SIGTERM, "which was not held off in the child"
 
 
 def test_an_error_of_a_worker_arrives_as_what_it_is(tmp_path: Path) -> None:

@@ -31,3 +31,14 @@ def test_the_words_of_a_command_hide_what_follows_a_secret_flag() -> None:
     words = ["/usr/bin/env", "--password", "hunter2", "/home/me/w.pt", "--auth"]
     assert masked(words) == ["…/env", "--password", "…", "…/w.pt", "--auth"]
     assert masked({"files": {"/home/me/w.pt": "12ab"}, "n": 3}) == {"files": {"…/w.pt": "12ab"}, "n": 3}
+
+
+def test_files_of_one_name_in_several_folders_stay_several_and_what_a_secret_s_name_stands_for_is_hidden() -> None:
+    assert masked({"/a/w.pt": "1", "/b/w.pt": "2", "/c/w.pt": "3"}) == {
+        "…/w.pt": "1", "…/w.pt (2)": "2", "…/w.pt (3)": "3",
+    }  # fmt: skip
+    assert masked({"password": "x", "API_KEY": ["y"], "n_tokens": 5}) == {
+        "password": "…",
+        "API_KEY": "…",
+        "n_tokens": 5,
+    }

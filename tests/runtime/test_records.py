@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import pytest
 
@@ -16,6 +17,7 @@ class Record:
     share: float = 0.5
     values: tuple[float, ...] = ()
     extra: float | None = None
+    kind: Literal["a", "b"] = "a"
 
 
 def test_a_record_is_built_from_json_with_tuples_for_lists() -> None:
@@ -29,6 +31,7 @@ def test_a_record_is_built_from_json_with_tuples_for_lists() -> None:
         {"name": "a"}, {"name": 1, "n": 1}, {"name": "a", "n": 1.0}, {"name": "a", "n": True}, {"name": "a", "n": "1"},
         {"name": "a", "n": 1, "share": float("nan")}, {"name": "a", "n": 1, "share": 10**400}, [],
         {"name": "a", "n": 1, "values": [1, "2"]}, {"name": "a", "n": 1, "values": [float("inf")]},
+        {"name": "a", "n": 1, "kind": "c"}, {"name": "a", "n": 1, "kind": []},
         {"name": "a", "n": 1, "other": 2}, {"name": "a", "n": 1, "extra": 10**400},
     ],
 )  # fmt: skip

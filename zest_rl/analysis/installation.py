@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -77,22 +77,22 @@ def check_packages() -> Iterator[Check]:
         yield Check("packages", "ok", f"all {len(core)} as required ({versions})")
 
 
-def check_limits() -> Iterator[Check]:
+def check_limits() -> list[Check]:
     """Check that this shell lets a process load torch and GL."""
     from zest_rl.runtime.address_space import TORCH, check_address_space
 
     check_address_space("torch", TORCH)
-    yield from ()
+    return []
 
 
-def check_cache() -> Iterator[Check]:
+def check_cache() -> list[Check]:
     """Check that nobody else can write to the cache."""
     from zest_rl.runtime.artifacts import cache_dir
     from zest_rl.runtime.cache import check_private
 
     if cache_dir().exists():
         check_private(cache_dir())
-    yield from ()
+    return []
 
 
 def check_disk() -> Iterator[Check]:
@@ -168,7 +168,7 @@ def check_ffmpeg() -> Iterator[Check]:
     yield Check("ffmpeg", "ok", imageio_ffmpeg.get_ffmpeg_version())
 
 
-CHECKS: dict[str, Callable[[], Iterator[Check]]] = {
+CHECKS: dict[str, Callable[[], Iterable[Check]]] = {
     "python": check_python,
     "packages": check_packages,
     "limits": check_limits,

@@ -15,6 +15,7 @@ from zest_rl.errors import Notice
 def notices_by(ui: Ui) -> Iterator[None]:
     """Let `ui` tell each `Notice` once, which Python would print with the line of code that it comes from."""
     with warnings.catch_warnings():
+        warnings.simplefilter("always", Notice)  # whatever PYTHONWARNINGS says
         show, told = warnings.showwarning, set[str]()
 
         def tell(

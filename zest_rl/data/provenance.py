@@ -7,36 +7,12 @@ and ``relabel`` (`RelabelRecord`). Fields that an earlier version did not write 
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import UnionType
-from typing import Any, Literal, Self, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Self
 
 from zest_rl.errors import BadInput
-
-
-def _field_values(record: type[Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values that a record has fields for, each of the field's type."""
-    known = {name: (values[name], hint) for name, hint in get_type_hints(record).items() if name in values}
-    for name, (value, hint) in known.items():
-        if not _fits(value, hint):
-            raise TypeError(f"{name} must be {getattr(hint, '__name__', hint)}, got {value!r:.80}")
-    return {name: value for name, (value, _) in known.items()}
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Whether a JSON value is of the type of a record's field, or what is made into it."""
-    origin, parts = get_origin(hint), get_args(hint)
-    if origin is UnionType:
-        return any(_fits(value, part) for part in parts)
-    if origin is Literal:
-        return value in parts
-    if origin is tuple:
-        return isinstance(value, list | tuple) and all(_fits(item, parts[0]) for item in value)
-    if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
-    return isinstance(value, origin or hint) and not (hint is int and isinstance(value, bool))
+from zest_rl.runtime.records import field_values, from_json
 
 
 @dataclass(frozen=True)
@@ -47,6 +23,17 @@ class CollectRecord:
     """The arguments, without names and numbers of processes."""
     result: Mapping[str, Any] = field(default_factory=dict)
     """Calibrated numbers, returns of the references, normalized return."""
+
+
+@dataclass(frozen=True)
+class ViewsRecord:
+    """Fields of `zest_rl.kitchen.views.Views`, which says what they mean."""
+
+    task: str
+    n_views: int
+    size: int
+    robot: bool
+    tolerance: float
 
 
 @dataclass(frozen=True)
@@ -64,14 +51,17 @@ class ScorerRecord:
     goal_share: float = 1.0
     """Share of the goals that were used."""
     views: Mapping[str, Any] | None = None
-    """Fields of `zest_rl.kitchen.views.Views`, from which kitchen states were rendered; None for other frames."""
+    """Of a `ViewsRecord`, from which kitchen states were rendered; None for other frames."""
     views_sha256: str | None = None
     """Hash of everything that such a frame depends on besides the state."""
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
         """Read what `to_json` returned."""
-        return cls(**_field_values(cls, {**values, **values["config"]}))
+        record = cls(**field_values(cls, {**values, **values["config"]}))
+        if record.views is not None:
+            from_json(ViewsRecord, record.views)
+        return record
 
     def to_json(self) -> dict[str, Any]:
         """Config and content hashes, as a dataset's metadata hold them."""
@@ -109,10 +99,7 @@ class RelabelRecord:
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
         """Read what `to_json` returned."""
-        kept = values.get("kept_goals")
-        scorer = ScorerRecord.from_json(values["scorer"])
-        made = {**values, "scorer": scorer, "kept_goals": None if kept is None else tuple(kept)}
-        record = cls(**_field_values(cls, made))
+        record = cls(**field_values(cls, {**values, "scorer": ScorerRecord.from_json(values["scorer"])}))
         if record.n_views < 1:
             raise ValueError("there must be 1 view or more, got 0")
         return record
@@ -177,11 +164,11 @@ class DatasetRecord:
             made = {
                 "id": dataset_id,
                 **{name: metadata.get(name) for name in ("env_spec", "ref_min_score", "ref_max_score")},
-                "collect": CollectRecord(**_field_values(CollectRecord, collect)) if collect else None,
+                "collect": CollectRecord(**field_values(CollectRecord, collect)) if collect else None,
                 "relabel": RelabelRecord.from_json(relabel) if relabel else None,
                 "fps": stages.get("recorded", {}).get("fps"),
             }
-            read = cls(**_field_values(cls, made))
+            read = cls(**field_values(cls, made))
             if not isinstance(read.env, dict) or not isinstance(read.env.get("kwargs", {}), dict):
                 raise TypeError(f"env_spec must be an object with an object of kwargs, got {read.env_spec:.80}")
             return read

@@ -7,7 +7,6 @@ trajectory, are fields of `Behaviour`.
 
 from __future__ import annotations
 
-import random
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from zest_rl.data.writer import Recording
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen.collect_config import LARGEST, check_flaws, check_n_episodes
-from zest_rl.kitchen.env import ACT_DIM, HORIZON, env_spec
+from zest_rl.kitchen.env import ACT_DIM, HORIZON, N_QVEL, OBS_DIM, env_spec
 from zest_rl.kitchen.experts import DONE_PROGRESS, Manner, add_uniform_noise, make_expert
 from zest_rl.kitchen.scene import N_QPOS
 from zest_rl.kitchen.tasks import get_task
@@ -32,7 +31,6 @@ from zest_rl.runtime.parallel import cached_jobs, chunks, read_parts
 from zest_rl.types import FloatArray
 
 EPISODES_PER_JOB = 5
-OBS_DIM, N_QVEL = 59, 29  # of the kitchen, see `zest_rl.kitchen.env.KitchenEnv`
 _ARRAYS = ("obs", "actions", "qpos", "qvel", "gt_reward", "gt_success")  # of a `Recording`
 STOP_BETWEEN = (0.1, 1.0)
 _CODE = ("behaviour.py", "env.py", "arm.py", "experts.py", "tasks.py")  # with the behaviour, determines an episode
@@ -181,9 +179,10 @@ def _check(folder: Path, jobs: Mapping[str, _Job]) -> None:
     kept = [name for name in jobs if (folder / f"{name}.npz").exists()]
     if not kept:
         return
-    name = random.choice(kept)
+    rng = np.random.default_rng()
+    name = kept[rng.integers(len(kept))]
     behaviour, indices = jobs[name]
-    i = random.randrange(len(indices))
+    i = int(rng.integers(len(indices)))
     if (cached := read_arrays(folder / f"{name}.npz", _layout(jobs[name]))) is None:
         return
     again = rollout(behaviour, indices[i])

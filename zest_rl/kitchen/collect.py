@@ -21,6 +21,7 @@ from zest_rl.kitchen.env import ENV_ID, env_spec
 from zest_rl.metrics import statistics
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import Arrays
+from zest_rl.runtime.records import reading_record
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,10 @@ def collect_dataset(
             if not reader.exists(config.dataset_id):
                 result = _collect(config, asked, path, n_workers, on_progress, on_result)
                 return Collected(config.dataset_id, path, result, already_there=False)
-    before = _collected_before(config, asked, path)
-    flaws = {name: before[name] for name in LARGEST}
-    remove_parts(Behaviour(config.task, "expert", seed=config.seed, **flaws))  # which a kill at the very end may leave
+    with reading_record(path, "choose another id with --dataset, or delete it"):
+        before = _collected_before(config, asked, path)
+        behaviour = Behaviour(config.task, "expert", seed=config.seed, **{name: before[name] for name in LARGEST})
+    remove_parts(behaviour)  # which a kill at the very end may leave
     return Collected(config.dataset_id, path, before, already_there=True)
 
 

@@ -14,7 +14,7 @@ LARGEST = {"noise_max": 2.0, "stop_share": 1.0, "slow_max": 0.9, "bias_max": 1.0
 
 
 MAX_EPISODES = 1_000_000
-"""75 GB, all of which are in memory when they are written, and 75 hours on one core."""
+"""75 GB, all of which are in memory when they are written."""
 
 
 def check_flaws(flaws: Mapping[str, float]) -> None:

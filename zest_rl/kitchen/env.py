@@ -42,6 +42,8 @@ HORIZON = 100
 ACT_DIM = 9
 """Seven arm joints, then two fingers."""
 ARM_DIM = 7
+OBS_DIM, N_QVEL = 59, 29
+"""Numbers of an observation, and velocities of the whole kitchen."""
 SETTLE_STEPS = 1000
 """Simulator steps (2 s) in which the objects come to rest before an episode."""
 FRAME_SKIP = 40

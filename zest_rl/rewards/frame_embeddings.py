@@ -6,7 +6,6 @@ run resumes at the episode where it stopped.
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -28,8 +27,9 @@ from zest_rl.sources.base import EpisodeFrames, Source
 from zest_rl.types import FloatArray
 
 STEPS_PER_BATCH = 16
-CHECKED_STEPS = 256
-"""The frames that are embedded again and compared are among the first of an episode: a video is decoded in order."""
+CHECKED_STEPS = 16
+"""The frames that are embedded again and compared are among the first of an episode: a video is decoded,
+and states are rendered, in order."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class FrameEmbeddings:
         """
         network = shared_embedder(embedder, precision, device)
         self._shared = _Shared(source.frames, WorkerEmbedder(embedder, precision, device, network.fingerprint))
-        self._layout: Layout = {"embeddings": (np.float32, (None, None, network.dim))}
+        self._layout: Layout = {"embeddings": (np.float32, (None, len(source.frames.views), network.dim))}
         self._source, self._n_workers, self._engine = source, n_workers, engine
         self._n_steps = source.trajectories.n_steps
         self._digests = [source.frames.digest(episode) for episode in range(len(self._n_steps))]
@@ -130,7 +130,8 @@ class FrameEmbeddings:
         }  # fmt: skip
         # the arrays themselves are verified when they are read
         cached = [i for i in range(len(self._digests)) if read_arrays(self._path(i), {}) is not None]
-        self._check(random.sample(cached, min(N_CHECKED, len(cached))), options)
+        checked = np.random.default_rng().choice(len(cached), min(N_CHECKED, len(cached)), replace=False)
+        self._check([cached[k] for k in checked], options)
         missing = set(range(len(self._digests))) - set(cached)
         jobs = {self._path(i).stem: _Job(i, self._n_steps[i]) for i in sorted(missing)}
         work, n_cached = partial(_embed_episode, self._shared), len(self._digests) - len(jobs)
@@ -142,10 +143,10 @@ class FrameEmbeddings:
 
     def _check(self, episodes: Sequence[int], options: Mapping[str, Any]) -> None:
         """Embed a frame of each of these episodes, which are in the cache, and compare; raises as `check_equal`."""
-        cached, places = {}, {}
+        rng, cached, places = np.random.default_rng(), {}, {}
         for i in episodes:
-            if (vectors := self._read(i)) is not None and len(vectors) > 0:
-                step = random.randrange(min(len(vectors), self._n_steps[i], CHECKED_STEPS))
+            if (vectors := self._read(i)) is not None:
+                step = int(rng.integers(min(self._n_steps[i], CHECKED_STEPS)))
                 cached[str(i)], places[str(i)] = vectors[step], (i, step)
         again = run_jobs(partial(_embed_frame, self._shared), places, n_workers=1, **options)
         check_equal(self._folder, ((cached[name], vectors) for name, vectors in again))
@@ -165,15 +166,14 @@ class FrameEmbeddings:
                 write_arrays(self._path(i), arrays)
                 self.n_embedded += 1
                 frames = arrays["embeddings"]
-            if len(frames) not in (n_steps, n_steps + 1):
-                raise BadInput(f"episode {i} has {n_steps} actions and {len(frames)} frames")
             if len(frames) == n_steps:
                 frames = np.concatenate([frames, frames[-1:]])
             yield EmbeddedEpisode(frames, np.arange(n_steps + 1))
 
     def _read(self, episode: int) -> FloatArray | None:
-        arrays = read_arrays(self._path(episode), self._layout)
-        return None if arrays is None else arrays["embeddings"]
+        """Return the embeddings of an episode's T or T + 1 frames, (n, V, D); None: not in the cache, or damaged."""
+        arrays, n_steps = read_arrays(self._path(episode), self._layout), self._n_steps[episode]
+        return arrays["embeddings"] if arrays and len(arrays["embeddings"]) in (n_steps, n_steps + 1) else None
 
     def _path(self, episode: int) -> Path:
         return self._folder / f"{self._digests[episode][:32]}.npz"

@@ -7,7 +7,6 @@ file (the goal's embeddings) with its config, so that the goal pictures are not 
 from __future__ import annotations
 
 import json
-import random
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -97,10 +96,10 @@ class Scorer:
         if self.goal is None:
             return
         embedder = shared_embedder(self.config.embedder, self.config.precision, device)
-        i, k = (random.randrange(len(some)) for some in (self.goal.starts, self.goal.goals))
-        one = replace(self.goal, starts=self.goal.starts[i : i + 1], goals=self.goal.goals[k : k + 1])
+        i, k = np.random.default_rng().integers([len(self.goal.starts), len(self.goal.goals)])
+        pair = replace(self.goal, starts=self.goal.starts[i : i + 1], goals=self.goal.goals[k : k + 1])
         with one_thread():
-            start, goal = embed_goal(one, embedder)
+            start, goal = embed_goal(pair, embedder)
         check_equal(cache_folder("goals"), [(self.starts[i], start[0]), (self.goals[k], goal[0])])
 
     def score(self, embeddings: FloatArray) -> FloatArray:
@@ -194,20 +193,25 @@ class Scorer:
         """Read what `save` wrote.
 
         Raises:
-            BadInput: the file names an embedder that this user did not, and did not trust (`trust_scorer`).
+            BadInput: the file names an embedder that this user did not, nor trust (`check_scorer`).
             ZestError: the file is missing or damaged, or the embedder or renderer here differs from the one that was
                 used (scores would not be comparable).
         """
-        config, views, described, starts, goals = _read(path)
+        config, views, saved, starts, goals = _read(path)
         _check_embedder(path, config)
         embedder = shared_embedder(config.embedder, config.precision, device)
-        scorer = cls(config, starts, goals, str(described["goal_sha256"]), embedder.fingerprint, views)
+        scorer = cls(config, starts, goals, saved.goal_sha256, embedder.fingerprint, views)
         record = scorer.record
-        changed = [key for key in ("embedder_sha256", "views_sha256") if getattr(record, key) != described.get(key)]
+        changed = [key for key in ("embedder_sha256", "views_sha256") if getattr(record, key) != getattr(saved, key)]
         if changed:
             raise ZestError(
                 f"the scorer {path} was made with another {' and '.join(k.removesuffix('_sha256') for k in changed)} "
                 "(weights, precision, or versions differ); relabel and train here, or use the versions of its meta.json"
+            )
+        if (dim := starts.shape[-1]) != embedder.dim:
+            raise BadInput(
+                f"{path} holds embeddings of {dim} numbers, but its embedder {config.embedder} makes {embedder.dim}; "
+                "relabel the dataset again"
             )
         return scorer
 
@@ -235,8 +239,8 @@ def _check_embedder(path: Path, config: ScorerConfig) -> None:
         check_trusted("embedder", config.embedder, f"{path} would load the embedder {config.embedder}")
 
 
-def _read(path: Path) -> tuple[ScorerConfig, Views | None, dict[str, Any], FloatArray, FloatArray]:
-    """Read a scorer's file: config, views, all of its description, starts and goals."""
+def _read(path: Path) -> tuple[ScorerConfig, Views | None, ScorerRecord, FloatArray, FloatArray]:
+    """Read a scorer's file: config, views, both with the hashes of what they mean, starts and goals."""
     from safetensors import safe_open
 
     if not path.exists():
@@ -244,7 +248,7 @@ def _read(path: Path) -> tuple[ScorerConfig, Views | None, dict[str, Any], Float
     check_file(path)
     with reading_record(path, "relabel the dataset again"):
         with safe_open(path, framework="numpy") as file:
-            described: dict[str, Any] = json.loads(file.metadata()["scorer"])
+            described = json.loads(file.metadata()["scorer"])
             starts, goals = file.get_tensor("starts"), file.get_tensor("goals")
         values = dict(described["config"])
         views = from_json(Views, values.pop("views")) if "views" in values else None
@@ -260,8 +264,7 @@ def _read(path: Path) -> tuple[ScorerConfig, Views | None, dict[str, Any], Float
         n_views = starts.shape[:-2] if views is None else (len(views.cameras),)[: starts.ndim - 2]
         if not (starts.shape[:-2] == goals.shape[:-2] == n_views and starts.shape[-1] == goals.shape[-1]):
             raise ValueError(f"starts of shape {starts.shape} beside goals of shape {goals.shape}")
-        described["goal_sha256"]
-    return config, views, described, starts, goals
+        return config, views, ScorerRecord.from_json(described), starts, goals
 
 
 def embed_goal_cached(goal: GoalSpec, embedder: Embedder) -> tuple[FloatArray, FloatArray]:

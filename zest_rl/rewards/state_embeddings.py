@@ -8,14 +8,12 @@ networks are exact only up to about 1e-6 across batch sizes and thread counts.
 
 A digest tells a damaged shard from a whole one, which holds what another process computed, perhaps with another GL
 driver. So the first time that embeddings of recorded states are taken from the cache, and at the first new state of a
-rollout, a few are computed again and compared. The default network costs 2 s to load where a run needs no other
-embedding; that is little beside a dataset of wrong rewards.
+rollout, a few are computed again and compared.
 """
 
 from __future__ import annotations
 
 import functools
-import random
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -154,7 +152,8 @@ class StateEmbedder:
     def _check(self, keys: Iterable[bytes]) -> None:
         """Once, embed a few of the states of these keys that are in the cache, and compare; raises as `check_equal`."""
         known = [] if self._checked else [key for key in keys if key in self._where]
-        cached = {key: self._row(key) for key in random.sample(known, min(N_CHECKED, len(known)))}
+        checked = np.random.default_rng().choice(len(known), min(N_CHECKED, len(known)), replace=False)
+        cached = {known[k]: self._row(known[k]) for k in checked}
         if not cached:
             return
         self._checked = True

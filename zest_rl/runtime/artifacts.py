@@ -2,7 +2,7 @@
 
 A file or folder under its final name is complete. Everything is built under a temporary name in the same folder and
 renamed once, so an interruption at any point leaves either the old artifact or the new one. Temporary files that a
-killed process left are removed by the next one that writes to their folder.
+killed process left are removed by the next process that writes to their folder.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ FOLDERS = {"MINARI_DATASETS_PATH": (".minari", "datasets"), "ZEST_CACHE": (".cac
 """Variables that name folders, and where these are in the home folder without the variable."""
 PATIENCE = 1.0
 """Seconds of waiting for a lock after which the user is told."""
-_TEMPORARY = re.compile(r"\..+\.([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.tmp.*")
+_TEMPORARY = re.compile(r"\..+\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.tmp.*")
 """Of `atomic_path`: the machine and the process that write the file."""
 _A_DAY = 86_400.0
 
@@ -130,9 +130,13 @@ def _is_below(path: Path, variable: str) -> bool:
 
 @functools.cache
 def _machine() -> str:
-    """Tell apart machines and containers, whose process ids mean different processes."""
-    namespace = Path("/proc/self/ns/pid")
-    return hash_json([platform.node(), str(namespace.readlink()) if namespace.exists() else ""])[:8]
+    """Tell apart machines, even of one name, and containers, whose process ids mean different processes."""
+    namespace, boot = Path("/proc/self/ns/pid"), Path("/proc/sys/kernel/random/boot_id")
+    return hash_json([
+        platform.node(),
+        str(namespace.readlink()) if namespace.exists() else "",
+        boot.read_text(encoding="utf-8") if boot.exists() else "",
+    ])[:8]  # fmt: skip
 
 
 def _is_stale(file: os.DirEntry[str]) -> bool:
@@ -142,7 +146,10 @@ def _is_stale(file: os.DirEntry[str]) -> bool:
         return False
     machine, process = match.groups()
     if machine != _machine():
-        return time.time() - file.stat().st_mtime > _A_DAY
+        try:
+            return time.time() - file.stat().st_mtime > _A_DAY
+        except FileNotFoundError:  # it has just been renamed
+            return False
     try:
         os.kill(int(process), 0)
     except ProcessLookupError:
@@ -152,11 +159,17 @@ def _is_stale(file: os.DirEntry[str]) -> bool:
     return False
 
 
+@functools.lru_cache(maxsize=1024)
+def _remove_stale(folder: Path) -> None:
+    """Remove the stale temporary files of a folder, once per process: a cache may have many files."""
+    for file in filter(_is_stale, os.scandir(folder)):
+        Path(file).unlink(missing_ok=True)
+
+
 def _new_temporary(path: Path) -> Path:
     """Make an empty file beside `path`, with the permissions of any new file, and remove the stale ones there."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    for file in filter(_is_stale, os.scandir(path.parent)):
-        Path(file).unlink(missing_ok=True)
+    _remove_stale(path.parent.absolute())
     temporary = path.with_name(f".{path.name}.{_machine()}-{os.getpid()}-{secrets.token_hex(4)}.tmp")
     os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
     return temporary

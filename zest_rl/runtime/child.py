@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 from zest_rl.errors import Notice, ZestError
-from zest_rl.runtime.parallel import cause_of_death, die_with_parent, starting_children
+from zest_rl.runtime.parallel import cause_of_death, prepare_child, starting_children
 
 Result = TypeVar("Result")
 
@@ -29,19 +29,21 @@ def write_in_child(what: str, write: Callable[..., Result], *args: object) -> Re
     context = multiprocessing.get_context("spawn")
     receive, send = context.Pipe(duplex=False)
     child = context.Process(target=_report, args=(send, write, *args))
-    with starting_children():
-        child.start()
-    send.close()
     try:
+        with starting_children():
+            child.start()
+        send.close()
         error, result, notices = receive.recv()
     except EOFError:
         child.join()
         error, result, notices = f"the writing process died ({cause_of_death(child.exitcode)})", None, ()
     except KeyboardInterrupt:
-        child.kill()  # it writes to a place that is removed now
+        if child.pid is not None:
+            child.kill()  # it writes to a place that is removed now
         raise
     finally:
-        child.join()
+        if child.pid is not None:
+            child.join()
     for notice in notices:
         warnings.warn(notice, Notice, stacklevel=2)
     if isinstance(error, ZestError):
@@ -52,11 +54,12 @@ def write_in_child(what: str, write: Callable[..., Result], *args: object) -> Re
 
 
 def _report(send: Any, write: Callable[..., Any], *args: object) -> None:
-    die_with_parent()  # else it would go on writing to the files of the next attempt
+    prepare_child()  # else it would go on writing to the files of the next attempt
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # on a full disk HDF5 prints hundreds of tracebacks
     error: ZestError | str | None = None
     result = None
     with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", Notice)  # whatever PYTHONWARNINGS says
         try:
             result = write(*args)
         except ZestError as refusal:

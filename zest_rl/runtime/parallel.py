@@ -16,6 +16,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
+from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import ModuleType
@@ -45,14 +46,18 @@ def cause_of_death(exit_code: int | None) -> str:
     """Say what ended a child process that had not finished: the signal, and what usually sends it."""
     if exit_code is None or exit_code >= 0:
         return f"exit code {exit_code}"
-    name = signal.Signals(-exit_code).name
+    name = next((each.name for each in signal.Signals if each == -exit_code), f"signal {-exit_code}")
     if exit_code in (-signal.SIGSEGV, -signal.SIGBUS, -signal.SIGABRT, -signal.SIGILL, -signal.SIGFPE):
         return f"{name}: a native library crashed, such as GL, HDF5 or CUDA, often for want of memory or disk"
     return f"{name}: killed, or out of memory"
 
 
-def die_with_parent() -> None:
-    """End this child process as soon as its parent ends, even if killed: nothing else would end it."""
+_INTERRUPTIONS = {signal.SIGINT, signal.SIGTERM}
+
+
+def prepare_child() -> None:
+    """Let SIGTERM end this child process of `starting_children`, and its parent's end, which nothing else would."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     parent = multiprocessing.parent_process()
 
     def watch() -> None:
@@ -70,10 +75,12 @@ def starting_children() -> Iterator[None]:
     With one core their results do not depend on the number of workers; set here and not in the child, because the
     libraries read it when they are loaded. A spawned process would import ``__main__``, which hangs if a script does
     its work there without ``if __name__ == "__main__"``; our jobs do not need that import. Ctrl-C is a signal to all
-    processes of a terminal; it is this one that ends its children.
+    processes of a terminal; it is this one that ends its children. SIGTERM waits, too, so that no child is started of
+    which this process does not know yet; it is `prepare_child` that lets it through there.
     """
+    resource_tracker.ensure_running()  # at its start it unblocks both signals
     with _STARTING:
-        unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited; here it waits
+        unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTIONS)  # inherited; here they wait
         main = sys.modules["__main__"]
         before = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
         os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
@@ -129,7 +136,7 @@ def run_jobs(
     if engine not in get_args(Engine):
         raise BadInput(f"unknown engine {engine!r}; {nearest(engine, get_args(Engine))}")
     most = WORKERS_PER_CORE * n_cores() if engine == "local" else MAX_ACTORS
-    if n_workers is not None and not 1 <= n_workers <= most:
+    if n_workers is not None and not (n_workers >= 1 and min(n_workers, len(jobs)) <= most):
         raise BadInput(
             f"the number of workers must be between 1 and {most} here, got {n_workers}; leave it out for one per core"
         )
@@ -147,7 +154,7 @@ _WORK: list[Callable[[Any], Any]] = []
 
 
 def _start_worker(work: Callable[[Any], Any]) -> None:
-    die_with_parent()
+    prepare_child()
     _WORK.append(work)
 
 
@@ -177,7 +184,8 @@ def _run_in_pool(
             for worker in workers:
                 worker.join(10)  # the pool's own thread, which may be waiting for it, else hides the code
             codes = [worker.exitcode for worker in workers]
-            first = next((code for code in codes if code not in (None, 0, -signal.SIGTERM)), None)  # ends the others
+            others_end = -signal.SIGTERM  # as the pool ends those that are left
+            first = next((code for code in codes if code not in (None, 0, others_end)), others_end)
             raise ZestError(
                 f"a worker process died in {stage} before all of {len(jobs)} parts were done "
                 f"({cause_of_death(first)}); finished parts are kept, run the same command again to go on"

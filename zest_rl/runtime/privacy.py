@@ -12,6 +12,7 @@ _WORD_IS_PATH = re.compile(r"(?<![^=:@,])/(?!/)(?:[^,]*/)?")
 _PATH_IN_TEXT = re.compile(r"(?<![^\s'\"(])/(?!/)(?:[^\s,'\"]*/)?")
 _SECRET_FLAG = r"-{%s}[\w-]*?(?:pass(?:word|wd|phrase)?|secret|token|api[-_]?key|credentials?|auth)"
 _FLAG = re.compile(_SECRET_FLAG % "1,2", re.IGNORECASE)
+_SECRET_KEY = re.compile(_SECRET_FLAG % "0,2", re.IGNORECASE)
 _SECRET = re.compile(
     rf"(?:(?<!\S)({_SECRET_FLAG % '0,2'}=|{_SECRET_FLAG % '1,2'}\s+)|(?<=://)(?=[^/@\s]+@))[^@\s]+", re.IGNORECASE
 )
@@ -22,12 +23,18 @@ def masked(value: Any) -> Any:
     """Return a JSON-ready value whose strings name no folder and hold no secret.
 
     ``--goal=/home/me/goals`` becomes ``--goal=…/goals``, ``--password=x`` ``--password=…``; in a list of words, what
-    follows ``--password`` is hidden.
+    follows ``--password`` is hidden, and in a mapping the value of ``password``. Keys that become equal are numbered.
     """
     if isinstance(value, str):
         return _mask(value)
     if isinstance(value, Mapping):
-        return {masked(key): masked(item) for key, item in value.items()}
+        shown: dict[Any, Any] = {}
+        for key, item in value.items():
+            name, n = masked(key), 1
+            while name in shown:
+                name, n = f"{masked(key)} ({n + 1})", n + 1
+            shown[name] = HIDDEN if isinstance(key, str) and _SECRET_KEY.fullmatch(key) else masked(item)
+        return shown
     if isinstance(value, list | tuple):
         flags = [isinstance(item, str) and _FLAG.fullmatch(item) is not None for item in value]
         return [HIDDEN if hide else masked(item) for hide, item in zip([False, *flags], value, strict=False)]

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import math
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
 from pathlib import Path
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime.address_space import is_out_of_memory
 
 T = TypeVar("T")
-
-_KINDS: Mapping[str, tuple[type, ...]] = {
-    "str": (str,), "int": (int,), "bool": (bool,), "float": (float, int), "None": (type(None),),
-    "tuple[float, ...]": (list, tuple),
-}  # fmt: skip
-"""What JSON has for the annotation of a field; fields of other types are checked by the dataclass itself."""
 
 
 @contextmanager
@@ -44,24 +38,38 @@ def from_json(record: type[T], values: Mapping[str, Any]) -> T:
     """Build a flat dataclass from its fields in JSON, where lists stand for tuples.
 
     Raises:
-        TypeError: a field is missing, unknown or of another type.
-        ValueError: a number is not finite, or the dataclass refuses a value.
+        TypeError: a field is missing, unknown, of another type, or a number that is not finite.
+        ValueError: the dataclass refuses a value.
     """
     given = dict(values)
-    for field in fields(record):  # type: ignore[arg-type]  # dataclasses have no common type
-        if field.name not in given:
-            continue
-        value, options = given[field.name], str(field.type).split(" | ")
-        if not all(option in _KINDS for option in options):
-            continue
-        allowed = tuple(kind for option in options for kind in _KINDS[option])
-        if type(value) not in allowed:
-            raise TypeError(f"{field.name} must be {field.type}, got {str(value)[:40]!r}")
-        numbers = (
-            value if isinstance(value, list | tuple) else [value] if "float" in options and value is not None else []
-        )
-        if not all(type(number) in (float, int) and math.isfinite(number) for number in numbers):
-            raise ValueError(f"{field.name} must be finite, got {str(value)[:40]}")
-        if isinstance(value, list):
-            given[field.name] = tuple(value)
-    return record(**given)
+    return record(**{**given, **field_values(record, given)})
+
+
+def field_values(record: type[Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values in JSON that a dataclass has fields for, with tuples for lists where the field is a tuple.
+
+    Raises:
+        TypeError: one is not of its field's type, or not finite.
+    """
+    known = {name: (values[name], hint) for name, hint in get_type_hints(record).items() if name in values}
+    for name, (value, hint) in known.items():
+        if not _fits(value, hint):
+            raise TypeError(f"{name} must be {getattr(hint, '__name__', hint)}, got {value!r:.80}")
+    return {
+        name: tuple(value) if isinstance(value, list) and _fits((), hint) else value
+        for name, (value, hint) in known.items()
+    }
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a JSON value is of the type of a field, or what is made into it."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin is UnionType:
+        return any(_fits(value, part) for part in parts)
+    if origin is Literal:
+        return value in parts
+    if origin is tuple:
+        return isinstance(value, list | tuple) and all(_fits(item, parts[0]) for item in value)
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    return isinstance(value, origin or hint) and not (hint is int and isinstance(value, bool))

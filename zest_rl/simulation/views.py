@@ -15,7 +15,7 @@ from zest_rl.errors import BadInput
 from zest_rl.simulation.rendering import Camera
 
 MAX_VIEWS = 1000
-"""Cameras of a ring: three to a degree, and a hundred times more than were of any use."""
+"""Cameras of a ring: about three to a degree; each state's frames of all of them are in memory at once."""
 
 
 def ring(
