@@ -15,14 +15,16 @@ from safetensors.numpy import load_file, save_file
 from zest_rl import cli
 from zest_rl.agents import load_policy
 from zest_rl.agents.foreign import identify
-from zest_rl.data.reader import dataset_path
+from zest_rl.data.reader import dataset_path, open_dataset
 from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import EvaluationConfig, evaluate
 from zest_rl.report.comparison_page import compare_runs
+from zest_rl.report.sections import GOALS
 from zest_rl.rewards.scorer import SCORER_FILE, Scorer
 from zest_rl.runtime import artifacts
 
 DOWNLOADED = EvaluationConfig(n_episodes=1, seed=3)
+TRAIN = ("--hidden-size", "16", "--n-layers", "1", "--threads", "1", "--device", "cpu")
 ZEROS = "import sys, json\nfor line in sys.stdin:\n    n = len(json.loads(line).get('obs', []))\n    "
 ZEROS += "print(json.dumps({'ready': 1, 'actions': [[0] * 9] * n}), flush=True)\n"
 
@@ -120,16 +122,41 @@ def test_a_dataset_that_was_relabeled_here_needs_no_flag_and_a_copy_of_it_elsewh
     weights = tmp_path / "w.pth"
     torch.save(timm.create_model("resnet10t").state_dict(), weights)
     uri = f"timm:resnet10t@{weights}"
-    source = next(iter(json.loads(p.read_text())["dataset"]["id"] for p in [trained / "gt-0" / "meta.json"]))
+    source = artifacts.read_json(trained / "gt-0" / "meta.json")["dataset"]["id"]
     flags = ("--views", "1", "--tolerance", "0.5", "--n-workers", "1")
     dataset = zest("relabel", source, "--embedder", uri, *flags)["dataset"]
     path = dataset_path(dataset) / SCORER_FILE
     assert Scorer.load(path).config.embedder == uri
+    with open_dataset(dataset) as ds:
+        assert ds.metadata["description"].endswith("by timm:resnet10t@…/w.pth.")
     forget()
     with pytest.raises(BadInput, match="add --trust"):
         Scorer.load(path)
     zest("inspect", dataset, "--trust", "--output", tmp_path / "page.html", "--n-workers", "1")
     assert np.isfinite(Scorer.load(path).goals).all()
+    run = zest("train", "dt", dataset, "--n-updates", "1", "--run-dir", tmp_path / "run", *TRAIN)["run"]
+    asked = ("--n-episodes", "1", "--no-videos", "--n-workers", "1")
+    forget()
+    assert cli.main(["evaluate", run, *asked]) == 2
+    zest("evaluate", run, *asked, "--trust")
+    forget()
+    assert cli.main(["report", run, "--output", str(tmp_path / "report.html")]) == 2
+    zest("report", run, "--output", tmp_path / "report.html", "--trust")
+    assert Scorer.load(path).config.embedder == uri, "the word is remembered"
+
+
+def test_a_report_needs_no_scorer_but_the_one_that_it_loads(trained: Path) -> None:
+    meta = artifacts.read_json(trained / "dt-0" / "meta.json")
+    first = meta["dataset"]["id"]
+    other = first.replace("-v0", "-v1")
+    shutil.copytree(dataset_path(first), dataset_path(other))
+    (dataset_path(other) / SCORER_FILE).unlink()
+    (dataset_path(other) / "zest_manifest.json").unlink()
+    artifacts.write_json(trained / "dt-0" / "meta.json", meta | {"dataset": meta["dataset"] | {"id": other}})
+    for run in ("bc-0", "dt-0"):
+        evaluate(trained / run, DOWNLOADED, n_workers=1)
+    for trust in (False, True):
+        assert len(compare_runs([trained / "bc-0", trained / "dt-0"], title="t", trust=trust).items(GOALS)) == 2
 
 
 def test_passwords_and_folders_of_a_command_are_in_the_run_alone(
@@ -140,7 +167,6 @@ def test_passwords_and_folders_of_a_command_are_in_the_run_alone(
     spec = f"{server(ZEROS)} --password=hunter2 --token abcdef"
     run = adopt(spec)
     assert "hunter2" in (run / "meta.json").read_text(), "which must be able to run it"
-    assert run.exists()
     evaluate(run, DOWNLOADED, n_workers=1, videos=True)
     page = write_report(compare_runs([run], title="t"), tmp_path / "page.html").read_text()
     for secret in ("hunter2", "abcdef", str(tmp_path)):

@@ -26,6 +26,7 @@ from zest_rl.rewards.state_embeddings import StateEmbeddings
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.parallel import Engine
+from zest_rl.runtime.privacy import masked
 from zest_rl.sources import KitchenStates, Source, open_source
 from zest_rl.types import FloatArray
 
@@ -209,7 +210,8 @@ def relabel_source(
             target_id,
             [rewards_from_scores(score, reward) for score in scores],
             scores,
-            description=f"Rewards are scores ({config.similarity}+{config.features}, {reward}) by {config.embedder}.",
+            description=f"Rewards are scores ({config.similarity}+{config.features}, {reward}) "
+            f"by {masked(config.embedder)}.",
             zest={"relabel": record.to_json()},
             extra=lambda folder: _write_scorer(folder, scorer),
         )

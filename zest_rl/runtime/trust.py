@@ -2,7 +2,8 @@
 
 A dataset or a run of somebody else may name a policy or a network, and with it a program, a package or a file. It is
 used only if this user named the very same on this machine (`zest adopt`, ``--embedder``) or trusted it by ``--trust``.
-What was named lies in the folder ``trusted`` of the cache, a small file each, by content: delete one to forget it.
+What was named lies in the folder ``trusted`` of the cache, a small file each, policies by the content of their files
+and embedders by name: delete one to forget it.
 """
 
 from __future__ import annotations
