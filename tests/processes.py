@@ -43,7 +43,7 @@ class Command:
             time.sleep(0.02)
 
     def all_end(self) -> bool:
-        """Whether no process is left; they may take a while on a busy machine."""
+        """Whether no process is left."""
         deadline = time.monotonic() + 60
         while self.alive() and time.monotonic() < deadline:
             time.sleep(0.05)

@@ -13,12 +13,12 @@ from zest_rl.cli.ui import SilentUi
 def test_doctor_finds_this_installation_fit(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
-    found = {check["name"]: check for check in result["checks"]}
-    assert set(found) >= {
+    checks = {check["name"]: check for check in result["checks"]}
+    assert set(checks) >= {
         "python", "packages", "cache", "datasets", "rendering", "weights", "cpu", "gpu", "ffmpeg",
     }  # fmt: skip
-    assert all(check["status"] != "fail" for check in found.values())
-    assert found["rendering"]["detail"].endswith(("egl", "osmesa", "glfw", "native"))
+    assert all(check["status"] != "fail" for check in checks.values())
+    assert checks["rendering"]["detail"].endswith(("egl", "osmesa", "glfw", "native"))
     assert result["next"].startswith("zest collect")
 
 

@@ -358,7 +358,7 @@ def test_weights_that_were_changed_are_refused(trained: Path) -> None:
         ({"max_episode_steps": 10**12}, "with max_episode_steps 1000000000000"),
         ({"kwargs": {"x": 1}}, "takes a task and an init_noise, got {'x': 1}"),
         ({"kwargs": {"init_noise": "a"}}, "init_noise must be float, got 'a'"),
-        ({"kwargs": {"init_noise": float("nan")}}, "init_noise must be finite"),
+        ({"kwargs": {"init_noise": float("nan")}}, "init_noise must be float, got nan"),
         ({"kwargs": {"task": ["micro"]}}, "task must be str"),
         (
             {
