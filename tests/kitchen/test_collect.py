@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,9 +19,12 @@ from read_dataset import read
 
 from zest_rl.cli import main
 from zest_rl.data import reader
+from zest_rl.data.folders import MANIFEST_FILE, METADATA_FILE
 from zest_rl.data.reader import Dataset
+from zest_rl.errors import BadInput
 from zest_rl.kitchen.collect import collect_dataset
 from zest_rl.kitchen.collect_config import CollectConfig
+from zest_rl.runtime import artifacts
 
 
 @pytest.fixture(autouse=True)
@@ -126,6 +130,16 @@ def test_the_library_does_what_the_command_does(
     described = read(DATASET, Dataset.describe)
     again = collect_dataset(config)
     assert (again.already_there, again.result) == (True, made.result)
+    metadata = artifacts.read_json(made.path / METADATA_FILE)
+    del metadata["zest"]["collect"]["result"]["noise_max"]
+    (tmp_path / "damaged/zest").mkdir(parents=True)
+    damaged = shutil.copytree(made.path, tmp_path / "damaged" / DATASET)
+    artifacts.write_json(damaged / METADATA_FILE, metadata)
+    (damaged / MANIFEST_FILE).unlink()
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "damaged"))
+    with pytest.raises(BadInput, match=r"as this package writes it \(KeyError: 'noise_max'\); choose another id"):
+        collect_dataset(config)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
     assert described == read(DATASET, Dataset.describe)
 

@@ -148,19 +148,22 @@ def embed_clips(
     Returns:
         (n, D) float32 per clip.
     """
-    folder, vectors, checked = cache_folder("clips"), [], False
+    folder, paths, vectors = cache_folder("clips"), [], []
     for clip in clips:
         parts = sorted(clip.path.iterdir()) if clip.path.is_dir() else [clip.path]
         content = [artifacts.hash_file(path) for path in parts if path.is_file()]
         digest = artifacts.hash_json([content, embedder.fingerprint, n_frames])
-        path = folder / f"{digest[:20]}.npz"
+        paths.append(folder / f"{digest[:20]}.npz")
+    rng = np.random.default_rng()
+    cached = [path for path in paths if path.exists()]
+    checked = cached[rng.integers(len(cached))] if cached else None
+    for clip, path in zip(clips, paths, strict=True):
         arrays = read_arrays(path, {"embeddings": (np.float32, (None, embedder.dim))})
         if arrays is None:
             with one_thread():
                 arrays = {"embeddings": embedder.embed_images(read_frames(clip.path, n_frames))}
             write_arrays(path, arrays)
-        elif not checked:
-            checked = True
+        elif path == checked:
             with one_thread():
                 again = embedder.embed_images(read_frames(clip.path, n_frames)[:1])
             check_equal(folder, [(arrays["embeddings"][:1], again)])
