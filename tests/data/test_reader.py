@@ -1,11 +1,9 @@
 from __future__ import annotations
 
 import json
-import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,28 +11,13 @@ import h5py
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given
-from hypothesis import strategies as st
 from minari_files import Recorded, write_minari
-from read_dataset import read
+from read_dataset import READERS, read
 
 from zest_rl.data import reader
 from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.sources import open_source
-
-READERS: dict[str, Callable[[str], Any]] = {
-    what.__name__: partial(read, what=what)
-    for what in (
-        Dataset.episodes,
-        Dataset.states,
-        Dataset.truth,
-        Dataset.scores,
-        Dataset.fingerprint,
-        Dataset.describe,
-        Dataset.kitchen_task,
-    )
-}
 
 
 @contextmanager
@@ -60,86 +43,7 @@ def change_metadata(dataset_id: str, **values: Any) -> None:
     (folder / reader.METADATA_FILE).write_text(json.dumps({**metadata, **values}))
 
 
-# --- ids --------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "dataset_id",
-    ["", "..", "../x-v0", "zest/../../x-v0", "x", "a/b", "a/b-v0", "zest/", "/zest/x-v0", "zest//x-v0", "zest/x-v",
-     "zest/x-v0/", "zest/x-v0\n", "zest/.x-v0", "zest/x y-v0", "zest/x\\y-v0", "~/x-v0", "zest/x..y-v0", "C:/x-v0"],
-)  # fmt: skip
-def test_a_malformed_id_is_refused_before_anything_is_made(
-    dataset_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    for refuse in (reader.dataset_path, reader.exists, *READERS.values()):
-        with pytest.raises(BadInput, match="a dataset id must look like 'namespace/name-v0'"):
-            refuse(dataset_id)
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("dataset_id", ["zest/kitchen-micro-noisy-v0", "kitchen-v12", "a1/b.c/d_e-f-v3", "zest/v-v0"])
-def test_a_well_formed_id_is_a_folder_below_the_root(
-    dataset_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    assert reader.dataset_path(dataset_id) == tmp_path / dataset_id
-    assert not reader.exists(dataset_id)
-
-
-@given(st.lists(st.sampled_from(["..", ".", "/", "a", "zest", "-v0", "x-v0", "~", "\\", "\n", " "]), max_size=6))
-def test_no_id_leads_out_of_the_root(parts: list[str]) -> None:
-    try:
-        path = reader.dataset_path("".join(parts))
-    except BadInput:
-        return
-    assert path.resolve().is_relative_to(reader.datasets_root().resolve())
-    assert path != reader.datasets_root()
-
-
-def test_the_root_is_where_minari_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    assert reader.datasets_root() == tmp_path / "minari"
-    monkeypatch.delenv("MINARI_DATASETS_PATH")
-    assert reader.datasets_root() == Path.home() / ".minari/datasets"
-
-
-@pytest.mark.parametrize("read_by_id", READERS.values(), ids=READERS)
-def test_a_missing_dataset_names_the_nearest(read_by_id: Callable[[str], Any], collected: str) -> None:
-    with pytest.raises(BadInput, match=rf"no dataset 'zest/kitchen-mirco-tiny-v0' .*did you mean '{collected}'\?"):
-        read_by_id("zest/kitchen-mirco-tiny-v0")
-
-
-def test_without_any_dataset_the_message_says_how_to_make_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    with pytest.raises(BadInput, match=r"valid: \(none\)\. Make one with `zest collect`"):
-        read("zest/x-v0", Dataset.episodes)
-    assert reader.list_datasets() == []
-
-
-def test_complete_datasets_are_listed_and_staged_ones_are_not(collected: str) -> None:
-    folder = reader.dataset_path(collected)
-    shutil.copytree(folder, folder.parent / ".other-v0.staging")
-    shutil.copytree(folder, reader.datasets_root() / "alone-v1")
-    assert reader.list_datasets() == ["alone-v1", collected]
-    assert reader.exists(collected)
-
-
 # --- reading ----------------------------------------------------------------------------------------------------------
-
-
-def test_datasets_and_namespaces_behind_links_are_listed_and_open(collected: str, tmp_path: Path) -> None:
-    root, elsewhere = reader.datasets_root(), tmp_path / "elsewhere"
-    (root / "zest").rename(elsewhere)
-    (root / "linked").symlink_to(elsewhere, target_is_directory=True)
-    (root / "mine").mkdir()
-    (root / "mine" / "one-v0").symlink_to(elsewhere / collected.split("/")[-1], target_is_directory=True)
-    (elsewhere / "back").symlink_to(root, target_is_directory=True)
-    (root / "nowhere").symlink_to(tmp_path / "gone")
-    listed = reader.list_datasets()
-    assert {"linked/kitchen-micro-tiny-v0", "mine/one-v0"} <= set(listed)
-    for dataset_id in ("linked/kitchen-micro-tiny-v0", "mine/one-v0"):
-        assert len(read(dataset_id, Dataset.episodes)) == 4
 
 
 def test_what_is_read_fits_together(collected: str) -> None:
