@@ -25,6 +25,7 @@ from zest_rl.report.episodes import paired_episodes
 from zest_rl.report.goals import goal_panel, goal_scatter
 from zest_rl.report.methods import Method, latest_evaluation, methods_of_runs
 from zest_rl.report.sections import CAVEATS, DETAILS, EPISODES, GOALS, LEARNING_CURVES, RESULTS
+from zest_rl.runtime.arrays import read_arrays, write_arrays
 
 CONFIG = EvaluationConfig(n_episodes=2, seed=11, rtg="constant")
 
@@ -145,9 +146,13 @@ def test_a_return_curve_holds_the_snapshots_that_were_evaluated_in_every_run(tra
             snapshot = shutil.copytree(run, run / "snapshots" / f"update-{step:09d}", ignore=lambda *_: own)
             edit(snapshot, lambda meta, step=step: meta.update(n_updates=step))  # type: ignore[misc]
             (stored,) = snapshot.glob("evaluations/*/result.json")
+            (part,) = stored.parent.glob("parts/*.npz")
+            arrays = read_arrays(part) or {}
+            arrays["gt_reward"][:, -1] -= 10.0 * step
+            write_arrays(part, arrays)
             result = json.loads(stored.read_text())
-            for episode in result["episodes"]:
-                episode["gt_return"] -= 10.0 * step
+            for episode, rewards in zip(result["episodes"], arrays["gt_reward"], strict=True):
+                episode["gt_return"] = float(rewards[1:].sum(dtype=np.float64))
             stored.write_text(json.dumps(result))
     evaluate(runs[0] / "snapshots" / "update-000000002", replace(CONFIG, seed=77), n_workers=1)
     evaluation = latest_evaluation(runs[0])

@@ -79,8 +79,7 @@ def starting_children() -> Iterator[None]:
     which this process does not know yet; it is `prepare_child` that lets it through there.
     """
     resource_tracker.ensure_running()  # at its start it unblocks both signals
-    with _STARTING:
-        unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTIONS)  # inherited; here they wait
+    with _STARTING, _interruptions_held_off():
         main = sys.modules["__main__"]
         before = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
         os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
@@ -92,7 +91,26 @@ def starting_children() -> Iterator[None]:
             for name in THREAD_VARIABLES:
                 del os.environ[name]
             os.environ.update(before)
-            signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)
+
+
+@contextmanager
+def _interruptions_held_off() -> Iterator[None]:
+    """Block both signals in processes that are started, and let those that come here wait for the end of the context.
+
+    A signal that is blocked in one thread goes to another, of a library perhaps, and Python calls its handler then.
+    """
+    came: list[int] = []
+    in_main = threading.current_thread() is threading.main_thread()  # which alone runs and sets handlers
+    handlers = {n: signal.signal(n, lambda number, _: came.append(number)) for n in _INTERRUPTIONS if in_main}
+    unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTIONS)  # inherited by processes
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for arrived in came:
+            signal.raise_signal(arrived)
 
 
 @contextmanager
