@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,15 @@ def damages(whole: Any, n: int, rng: random.Random) -> list[Any]:
 COUNTS = [60, pytest.param(1500, marks=pytest.mark.slow)]
 
 
+def check_reader(what: str, read: Callable[[int], Any], n_inputs: int) -> None:
+    """Read the whole input, number 0, and the damaged ones after it, which are read or refused."""
+    first, *others = outcomes(read, n_inputs)
+    assert first.kind == "read", first.detail
+    counts, bad = faults(others)
+    print(what, len(others), dict(counts))
+    assert not bad, bad[0].detail
+
+
 @pytest.mark.parametrize("n", COUNTS)
 @pytest.mark.parametrize("run", ["bc-0", "dt-0", "adopted"])
 def test_a_damaged_description_of_a_run_is_read_or_refused(run: str, n: int, trained: Path) -> None:
@@ -50,11 +60,7 @@ def test_a_damaged_description_of_a_run_is_read_or_refused(run: str, n: int, tra
         methods_of_runs([folder])
         return load_policy(folder, trust=True).agent
 
-    first, *others = outcomes(read, len(damaged))
-    assert first.kind == "read", first.detail
-    counts, bad = faults(others)
-    print(run, "meta.json", len(others), dict(counts))
-    assert not bad, bad[0].detail
+    check_reader(f"{run} meta.json", read, len(damaged))
 
 
 @pytest.mark.parametrize("n", COUNTS)
@@ -68,11 +74,7 @@ def test_damaged_weights_of_a_run_are_refused_even_under_their_own_hash(n: int, 
         artifacts.write_json(folder / "meta.json", meta | {"model_sha256": artifacts.hash_bytes(damaged[i])})
         return load_policy(folder).agent
 
-    first, *others = outcomes(read, n + 1)
-    assert first.kind == "read", first.detail
-    counts, bad = faults(others)
-    print("model.safetensors", n, dict(counts))
-    assert not bad, bad[0].detail
+    check_reader("model.safetensors", read, n + 1)
 
 
 @pytest.mark.parametrize("n", COUNTS)
@@ -91,11 +93,7 @@ def test_a_damaged_scorer_is_read_or_refused(n: int, trained: Path) -> None:
         path.write_bytes(damaged[i])
         check_scorer(path)
 
-    first, *others = outcomes(read, len(damaged))
-    assert first.kind == "read", first.detail
-    counts, bad = faults(others)
-    print("scorer", len(others), dict(counts))
-    assert not bad, bad[0].detail
+    check_reader("scorer", read, len(damaged))
 
 
 @pytest.mark.parametrize("n", COUNTS)
@@ -111,11 +109,7 @@ def test_a_damaged_environment_of_a_run_is_evaluated_or_refused(n: int, trained:
         artifacts.write_json(path, meta | {"dataset": damaged[i]})
         return hash_json(evaluate(path.parent, EvaluationConfig(n_episodes=1, seed=i), n_workers=1).summary())
 
-    first, *others = outcomes(read, len(damaged))
-    assert first.kind == "read", first.detail
-    counts, bad = faults(others)
-    print("environment", len(others), dict(counts))
-    assert not bad, bad[0].detail
+    check_reader("environment", read, len(damaged))
 
 
 @pytest.mark.parametrize("n", COUNTS)
@@ -128,11 +122,7 @@ def test_a_damaged_result_of_an_evaluation_is_read_or_refused(n: int, trained: P
         (folder / "result.json").write_text(json.dumps(damaged[i]))
         return hash_json(read_evaluation(folder).summary())
 
-    first, *others = outcomes(read, n + 1)
-    assert first.kind == "read", first.detail
-    counts, bad = faults(others)
-    print("result.json", n, dict(counts))
-    assert not bad, bad[0].detail
+    check_reader("result.json", read, n + 1)
 
 
 @pytest.mark.parametrize("n", COUNTS)
@@ -148,11 +138,7 @@ def test_a_damaged_log_of_a_training_is_read_or_refused(n: int, trained: Path) -
         with MetricsLog(path.parent, 20):
             pass
 
-    first, *others = outcomes(read, len(damaged))
-    assert first.kind == "read", first.detail
-    counts, bad = faults(others)
-    print("metrics.csv", len(others), dict(counts))
-    assert not bad, bad[0].detail
+    check_reader("metrics.csv", read, len(damaged))
 
 
 @pytest.mark.parametrize("n", COUNTS)
