@@ -13,7 +13,7 @@ from typing import Any
 import safetensors.torch
 import torch
 
-from zest_rl.agents import bc, dt, foreign
+from zest_rl.agents import bc, dt, foreign, rvs
 from zest_rl.agents.base import Agent, DataFacts, Policy
 from zest_rl.embedders import find_device
 from zest_rl.errors import BadInput, ZestError, nearest
@@ -26,6 +26,7 @@ __all__ = ["AGENTS", "Agent", "Policy", "get_agent", "load_policy"]
 AGENTS: dict[str, Agent[Any]] = {
     "bc": bc.AGENT,
     "dt": dt.AGENT,
+    "rvs": rvs.AGENT,
 }
 
 
@@ -80,10 +81,10 @@ def _load(run_dir: Path, meta: dict[str, Any], device: torch.device) -> Policy:
     with reading_record(run_dir / "meta.json"), torch.random.fork_rng(devices=[]):  # initial weights are replaced
         tensors = safetensors.torch.load(weights)
         with torch.device("meta"):  # makes no room yet
-            shapes = {name: tensor.shape for name, tensor in agent.build(config, facts).state_dict().items()}
+            shapes = {name: tensor.shape for name, tensor in agent.networks(config, facts).state_dict().items()}
         if shapes != {name: tensor.shape for name, tensor in tensors.items()}:
             raise ValueError(f"its config is not that of {path.name}")
-        model = agent.build(config, facts)
+        model = agent.networks(config, facts)
         model.load_state_dict(tensors)
     model = model.to(device).eval()
     with reading_record(run_dir / "meta.json"):

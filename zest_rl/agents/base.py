@@ -16,12 +16,14 @@ from zest_rl.errors import BadInput
 from zest_rl.types import Episode, FloatArray
 
 Batch = dict[str, Tensor]
+T = TypeVar("T")
 Sampler = Callable[[np.random.Generator], Batch]
 
 # The Decision Transformer's code divides by std + 1e-6: a joint that never moved in the data would become a huge number
 # once it moves. Hence a floor (rad or m, as the kitchen's observations) and a bound (in standard deviations).
 STD_FLOOR = 1e-3
 MAX_NORMALIZED = 10.0
+MAX_NETWORKS = 100
 
 
 @dataclass(frozen=True)
@@ -163,6 +165,8 @@ class OptimizerConfig:
     (1 + n) / (10 + n): about the last ninth of a training is averaged, until 0.999 is reached after 9000 updates."""
     amp: Precision = "auto"
     """Precision of matrix products; auto is bf16 where the hardware has it."""
+    n_networks: int = 1
+    """Networks that are trained side by side from different initial weights; the mean of their actions acts."""
 
     def optimizer_rules(self) -> Rules:
         """Return the rules of these fields."""
@@ -173,6 +177,7 @@ class OptimizerConfig:
             "grad_clip": (0 < self.grad_clip < float("inf"), "positive"),
             "ema_decay": (0 <= self.ema_decay < 1, "in [0, 1)"),
             "amp": (self.amp in get_args(Precision), f"one of {', '.join(get_args(Precision))}"),
+            "n_networks": (1 <= self.n_networks <= MAX_NETWORKS, f"in 1 … {MAX_NETWORKS}"),
         }
 
 
@@ -181,6 +186,63 @@ def check_fields(title: str, values: Any, rules: Rules) -> None:
     problems = [f"{f} must be {rule}, got {getattr(values, f)!r}" for f, (holds, rule) in rules.items() if not holds]
     if problems:
         raise BadInput(f"{title}: " + "; ".join(problems))
+
+
+def check_returns(facts: DataFacts) -> None:
+    """Raise `BadInput` if all returns are zero, so that nothing can be asked for."""
+    if facts.return_scale == 0:
+        raise BadInput(
+            "a policy conditioned on returns needs returns that are not all 0; check that the dataset is relabeled, or "
+            "set condition_on_return to false"
+        )
+
+
+class ReturnToGo:
+    """The returns that N episodes still ask for, in the data's units; zeros for a policy that uses none."""
+
+    def __init__(self, facts: DataFacts, is_used: bool):
+        self._scale = facts.return_scale if is_used else np.inf
+        self._is_used = is_used
+        self._remaining = np.zeros(0)
+
+    def __len__(self) -> int:
+        return len(self._remaining)
+
+    def begin(self, n_episodes: int, target_return: float | None) -> None:
+        """Ask for `target_return` in N episodes.
+
+        Raises:
+            BadInput: returns are used, and it is not a finite number.
+        """
+        if self._is_used and (target_return is None or not np.isfinite(target_return)):
+            raise BadInput(
+                f"a policy conditioned on returns must be asked for a finite return, got {target_return}; "
+                "take a quantile of the training returns from meta['return_quantiles']"
+            )
+        self._remaining = np.full(n_episodes, target_return or 0.0)
+
+    def scaled(self) -> FloatArray:
+        """Return (N,) float32, divided by the largest absolute return of the data."""
+        return (self._remaining / self._scale).astype(np.float32)
+
+    def subtract(self, rewards: FloatArray) -> None:
+        """Subtract what the last actions earned, (N,)."""
+        self._remaining = self._remaining - rewards
+
+
+def mlp(n_inputs: int, hidden_size: int, n_layers: int, n_outputs: int, dropout: float) -> nn.Sequential:
+    """Return linear, ReLU and dropout for each hidden layer, then a linear layer and tanh: [batch, n_outputs]."""
+    layers: list[nn.Module] = []
+    for width in [n_inputs, *[hidden_size] * (n_layers - 1)]:
+        layers += [nn.Linear(width, hidden_size), nn.ReLU(), nn.Dropout(dropout)]
+    return nn.Sequential(*layers, nn.Linear(hidden_size, n_outputs), nn.Tanh())
+
+
+def mean_over_networks(compute: Callable[[nn.Module, T], Tensor], model: nn.Module, batch: T) -> Tensor:
+    """Return the mean of ``compute(network, batch)``, a loss or actions, over the networks of `Agent.networks`."""
+    if not isinstance(model, nn.ModuleList):
+        return compute(model, batch)
+    return torch.stack([compute(network, batch) for network in model]).mean(dim=0)
 
 
 class Policy(Protocol):
@@ -226,10 +288,15 @@ class Agent(Generic[ConfigT]):
     config: type[ConfigT]
     """Frozen dataclass that checks itself."""
     build: Callable[[ConfigT, DataFacts], nn.Module]
-    """Model with fresh weights, drawn from torch's global generator."""
+    """One network with fresh weights, drawn from torch's global generator."""
     sampler: Callable[[ConfigT, DataFacts, Sequence[Episode]], Sampler]
     """From the data to a function that draws one batch; its ``valid``, if any, is False for padding."""
     loss: Callable[[nn.Module, Batch], Tensor]
     """Scalar to minimise: an average over the batch's rows, or over the elements that are valid."""
     policy: Callable[[nn.Module, ConfigT, DataFacts, dict[str, Any], torch.device], Policy]
     """From a trained model (in eval mode, on the device) and the run's meta to a policy."""
+
+    def networks(self, config: ConfigT, facts: DataFacts) -> nn.Module:
+        """Return the model: one network, or ``config.n_networks`` in a list."""
+        networks = [self.build(config, facts) for _ in range(config.n_networks)]
+        return networks[0] if len(networks) == 1 else nn.ModuleList(networks)

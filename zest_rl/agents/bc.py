@@ -37,6 +37,8 @@ from zest_rl.agents.base import (
     check_fields,
     check_obs,
     few_weights,
+    mean_over_networks,
+    mlp,
     whole,
 )
 from zest_rl.types import Episode, FloatArray
@@ -75,12 +77,13 @@ class BCConfig(OptimizerConfig):
 
 def build_model(config: BCConfig, facts: DataFacts) -> nn.Module:
     """Return the MLP: [batch, obs_dim] → [batch, act_dim] in [-1, 1]."""
-    layers: list[nn.Module] = []
-    width = facts.obs_dim
-    for _ in range(config.n_layers):
-        layers += [nn.Linear(width, config.hidden_size), nn.ReLU(), nn.Dropout(config.dropout)]
-        width = config.hidden_size
-    return nn.Sequential(*layers, nn.Linear(width, facts.act_dim), nn.Tanh())
+    return mlp(facts.obs_dim, config.hidden_size, config.n_layers, facts.act_dim, config.dropout)
+
+
+def predict_actions(model: nn.Module, obs: Tensor) -> Tensor:
+    """Return the actions [batch, act_dim] float32 for normalised obs [batch, obs_dim]."""
+    predicted: Tensor = model(obs)
+    return predicted.float()
 
 
 # ----------------------------------------------------------------------------------------------------------- batch
@@ -110,8 +113,7 @@ def make_sampler(config: BCConfig, facts: DataFacts, episodes: Sequence[Episode]
 
 def loss(model: nn.Module, batch: Batch) -> Tensor:
     """Return the squared error, averaged over the batch and the action's dimensions."""
-    predicted: Tensor = model(batch["obs"])  # [batch, act_dim]
-    return (predicted.float() - batch["actions"]).square().mean()
+    return (predict_actions(model, batch["obs"]) - batch["actions"]).square().mean()
 
 
 # ------------------------------------------------------------------------------------------------------------- act
@@ -139,7 +141,7 @@ class BCPolicy:
         check_obs(obs, self._n_episodes, self._facts.obs_dim)
         normalized = torch.from_numpy(self._facts.normalize(obs)).to(self._device)
         with self._autocast:
-            actions: Tensor = self._model(normalized).float()
+            actions = mean_over_networks(predict_actions, self._model, normalized)
         return actions.cpu().numpy()
 
     def observe(self, rewards: FloatArray) -> None:

@@ -35,11 +35,14 @@ from zest_rl.agents.base import (
     DataFacts,
     OptimizerConfig,
     Policy,
+    ReturnToGo,
     Sampler,
     autocast,
     check_fields,
     check_obs,
+    check_returns,
     few_weights,
+    mean_over_networks,
     returns_to_go,
     whole,
 )
@@ -62,6 +65,8 @@ class DTConfig(OptimizerConfig):
     """False zeroes the return-to-go: the same network without any information from the scores."""
     context_len: int = 20
     """K, the steps that the network sees."""
+    sees_actions: bool = True
+    """False zeroes the past actions that the network sees, which it can otherwise copy."""
     timesteps: Timesteps = "absolute"
     """What a step's embedding counts from: the start of the episode, as in the paper, or the start of the window."""
     hidden_size: int = 128
@@ -149,7 +154,7 @@ def predict_actions(model: nn.Module, batch: Batch) -> Tensor:
     """Return the actions [batch, K, act_dim] float32 that the model would take at each step of its windows."""
     output = model(
         states=batch["obs"],
-        actions=batch["actions"],
+        actions=batch["seen_actions"],
         returns_to_go=batch["rtg"],
         timesteps=batch["timesteps"],
         attention_mask=batch["valid"].long(),
@@ -170,11 +175,8 @@ def make_sampler(config: DTConfig, facts: DataFacts, episodes: Sequence[Episode]
     Raises:
         BadInput: all returns are zero although the model is to be conditioned on them.
     """
-    if config.condition_on_return and facts.return_scale == 0:
-        raise BadInput(
-            "a Decision Transformer conditioned on returns needs returns that are not all 0; check that the dataset "
-            "is relabeled, or set condition_on_return to false"
-        )
+    if config.condition_on_return:
+        check_returns(facts)
     scale = facts.return_scale if config.condition_on_return else np.inf
     lengths = np.array([len(e) for e in episodes])
     ends = np.repeat(np.cumsum(lengths), lengths)  # [step of the data], the first step after its episode
@@ -191,6 +193,7 @@ def make_sampler(config: DTConfig, facts: DataFacts, episodes: Sequence[Episode]
         return {
             "obs": obs[index],  # [batch, K, obs_dim]
             "actions": actions[index],  # [batch, K, act_dim]
+            "seen_actions": actions[index] if config.sees_actions else torch.zeros_like(actions[index]),
             "rtg": rtg[index][..., None],  # [batch, K, 1]
             "timesteps": torch.from_numpy(timesteps),  # [batch, K]
             "valid": torch.from_numpy(steps >= first),  # [batch, K], False is padding
@@ -224,12 +227,9 @@ class DTPolicy:
         self._model, self._facts, self._device = model, facts, device
         self._autocast = autocast(meta["precision"], device)
         self._config = config
-        self._start(0, 0.0)
-
-    def _start(self, n_episodes: int, target_return: float) -> None:
+        self._asked = ReturnToGo(facts, self.uses_return)
         self._step = 0
-        self._remaining = np.full(n_episodes, target_return)  # (N,) return still asked for, in the data's units
-        self._window: deque[dict[str, FloatArray]] = deque(maxlen=self._config.context_len)
+        self._window: deque[dict[str, FloatArray]] = deque(maxlen=config.context_len)
 
     def begin(self, n_episodes: int, target_return: float | None = None) -> None:
         """Start N new episodes.
@@ -237,12 +237,9 @@ class DTPolicy:
         Raises:
             BadInput: the model is conditioned on returns and `target_return` is not a finite number.
         """
-        if self.uses_return and (target_return is None or not np.isfinite(target_return)):
-            raise BadInput(
-                f"a Decision Transformer must be asked for a finite return, got {target_return}; "
-                "take a quantile of the training returns from meta['return_quantiles']"
-            )
-        self._start(n_episodes, target_return or 0.0)
+        self._asked.begin(n_episodes, target_return)
+        self._step = 0
+        self._window.clear()
 
     @torch.no_grad()
     def act(self, obs: FloatArray) -> FloatArray:
@@ -251,7 +248,7 @@ class DTPolicy:
         Raises:
             BadInput: the shape is wrong, or with absolute timesteps the episode is longer than all of the data.
         """
-        check_obs(obs, len(self._remaining), self._facts.obs_dim)
+        check_obs(obs, len(self._asked), self._facts.obs_dim)
         bound = self._facts.max_steps
         if self._config.timesteps == "absolute" and self._step >= bound:
             raise BadInput(
@@ -259,11 +256,10 @@ class DTPolicy:
                 f"evaluate with a horizon of at most {bound}, or train with timesteps 'relative'"
             )
         n = len(obs)
-        rtg = self._remaining / self._facts.return_scale if self.uses_return else np.zeros(n)
         step = {
             "obs": self._facts.normalize(obs),
-            "actions": np.zeros((n, self._facts.act_dim), np.float32),  # not known yet; only later steps attend to it
-            "rtg": rtg.astype(np.float32)[:, None],
+            "seen_actions": np.zeros((n, self._facts.act_dim), np.float32),  # not known yet; later steps attend to it
+            "rtg": self._asked.scaled()[:, None],
         }
         self._window.append(step)
         length = len(self._window)
@@ -273,14 +269,15 @@ class DTPolicy:
         arrays["valid"] = np.ones((n, length), dtype=bool)
         batch = {name: torch.tensor(array, device=self._device) for name, array in arrays.items()}
         with self._autocast:
-            actions = predict_actions(self._model, batch)[:, -1].cpu().numpy()
-        step["actions"] = actions
+            actions = mean_over_networks(predict_actions, self._model, batch)[:, -1].cpu().numpy()
+        if self._config.sees_actions:
+            step["seen_actions"] = actions
         self._step += 1
         return actions.copy()
 
     def observe(self, rewards: FloatArray) -> None:
         """Subtract the rewards (N,) of the last actions from the returns still asked for."""
-        self._remaining = self._remaining - rewards
+        self._asked.subtract(rewards)
 
     def end(self) -> dict[str, NDArray[Any]]:
         """Return nothing; there are no resources to release."""

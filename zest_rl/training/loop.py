@@ -35,7 +35,14 @@ import torch
 from torch import nn
 
 from zest_rl.agents import get_agent
-from zest_rl.agents.base import OptimizerConfig, autocast, check_fields, describe_data, resolve_precision
+from zest_rl.agents.base import (
+    OptimizerConfig,
+    autocast,
+    check_fields,
+    describe_data,
+    mean_over_networks,
+    resolve_precision,
+)
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint, snapshot_folder
@@ -147,7 +154,7 @@ def fit(
     ):
         if finished:
             return run_dir
-        model = definition.build(agent_config, facts).to(device)
+        model = definition.networks(agent_config, facts).to(device)
         state = TrainState.start(model, agent_config.weight_decay, config.seed)
         resume(run_dir, state)
         group.agree(updates_done=state.update)
@@ -162,7 +169,7 @@ def fit(
                 batch = {name: tensor.to(device) for name, tensor in rows.items()}
                 # loss
                 with autocast(precision, device):
-                    loss = definition.loss(state.model, batch) * weight
+                    loss = mean_over_networks(definition.loss, state.model, batch) * weight
                 # step
                 learning_rate = _learning_rate(agent_config, state.update)
                 for options in state.optimizer.param_groups:
