@@ -26,10 +26,10 @@ CONFIGS: dict[str, Any] = {
 }
 
 
-def two_behaviours() -> list[Episode]:
+def two_behaviours(n: int = 20) -> list[Episode]:
     """Half of the episodes go right and are rewarded, half go left and are punished; observations tell nothing."""
     episodes = []
-    for i in range(20):
+    for i in range(n):
         obs = np.random.default_rng(i).normal(size=(9, 3)).astype(np.float32)
         is_right = bool(i % 2)
         actions, rewards = np.full((8, 2), 0.6 if is_right else -0.6), np.full(8, 1.0 if is_right else -0.5)
@@ -50,7 +50,7 @@ def play(policy: Policy, target: float | None, reward: float = 0.0) -> FloatArra
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rvs") / "run"
-    return fit("rvs", SMALL, two_behaviours(), folder, TrainingConfig(n_updates=300, threads=1))
+    return fit("rvs", SMALL, two_behaviours(200), folder, TrainingConfig(n_updates=300, threads=1))
 
 
 def test_asked_for_a_high_or_a_low_return_it_chooses_the_behaviour_that_earned_it(run: Path) -> None:
