@@ -177,7 +177,7 @@ class OptimizerConfig:
             "grad_clip": (0 < self.grad_clip < float("inf"), "positive"),
             "ema_decay": (0 <= self.ema_decay < 1, "in [0, 1)"),
             "amp": (self.amp in get_args(Precision), f"one of {', '.join(get_args(Precision))}"),
-            "n_networks": (1 <= self.n_networks <= MAX_NETWORKS, f"in 1 … {MAX_NETWORKS}"),
+            "n_networks": whole(self.n_networks, MAX_NETWORKS),
         }
 
 

@@ -3,6 +3,7 @@
 A spec is one string:
 
 - ``same-scene``: the scene itself, rendered before and after; each camera view gets its own pair;
+- ``toys``: toy scenes of the task, made of simple shapes, before and after (`zest_rl.kitchen.toys`);
 - ``drawings``: the small drawings that come with the package;
 - a folder with ``init/`` and ``goal/``, each holding one or more pictures;
 - ``visual-tasks:real_imgs`` or ``visual-tasks:drawings``: the task's folder in the paper's Visual Tasks Dataset, at the
@@ -25,12 +26,14 @@ from numpy.typing import NDArray
 from zest_rl.data.images import left_out, list_images, read_image
 from zest_rl.errors import BadInput, Notice
 from zest_rl.kitchen.tasks import Task, get_task
+from zest_rl.kitchen.toys import toy_pictures
 from zest_rl.kitchen.views import Views, scene_pair
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.files import is_there, user_path
 from zest_rl.types import Frame
 
-SAME_SCENE, DRAWINGS, VISUAL_TASKS, TASK_TEXT, TEXT = "same-scene", "drawings", "visual-tasks:", "text", "text:"
+SAME_SCENE, TOYS, DRAWINGS, VISUAL_TASKS = "same-scene", "toys", "drawings", "visual-tasks:"
+TASK_TEXT, TEXT = "text", "text:"
 VISUAL_TASKS_VARIABLE = "ZEST_VISUAL_TASKS"
 
 
@@ -108,12 +111,12 @@ def read_text(spec: str) -> GoalSpec:
 
 
 def goal_folder(spec: str, task: Task) -> Path | None:
-    """Return the folder of pictures that a spec names; None for sentences and the scene itself.
+    """Return the folder of pictures that a spec names; None for sentences, toys and the scene itself.
 
     Raises:
         BadInput: there is no such folder, or the spec is of no known kind.
     """
-    if spec in (SAME_SCENE, TASK_TEXT) or spec.startswith(TEXT):
+    if spec in (SAME_SCENE, TOYS, TASK_TEXT) or spec.startswith(TEXT):
         return None
     if spec == DRAWINGS:
         return _drawings(task)
@@ -122,7 +125,7 @@ def goal_folder(spec: str, task: Task) -> Path | None:
     folder = user_path(spec)
     if not is_there(folder):
         raise BadInput(
-            f"unknown goal {spec!r}: it is neither {SAME_SCENE!r}, {DRAWINGS!r}, '{VISUAL_TASKS}real_imgs', "
+            f"unknown goal {spec!r}: it is neither {SAME_SCENE!r}, {TOYS!r}, {DRAWINGS!r}, '{VISUAL_TASKS}real_imgs', "
             "'text', 'text:START -> GOAL', nor an existing folder with init/ and goal/"
         )
     return folder
@@ -166,6 +169,8 @@ def read_goal(spec: str, task: Task, scene: tuple[NDArray[np.uint8], NDArray[np.
         return GoalSpec(spec, tuple(scene[0]), tuple(scene[1]), per_view=True)
     if spec == TASK_TEXT:
         return GoalSpec(spec, (task.start_text,), (task.goal_text,))
+    if spec == TOYS:
+        return GoalSpec(spec, *toy_pictures(task))
     folder = goal_folder(spec, task)
     return read_text(spec) if folder is None else read_folder(folder, spec)
 
@@ -195,8 +200,11 @@ def read_free_goal(spec: str) -> GoalSpec:
     if spec.startswith(TEXT):
         return read_text(spec)
     folder = user_path(spec)
-    if spec in (SAME_SCENE, DRAWINGS, TASK_TEXT) or spec.startswith(VISUAL_TASKS) or not is_there(folder):
-        kitchen = f"{SAME_SCENE!r}, {DRAWINGS!r}, 'text' and '{VISUAL_TASKS}…' are of zest/Kitchen-v1's tasks alone"
+    of_kitchen = (SAME_SCENE, TOYS, DRAWINGS, TASK_TEXT)
+    if spec in of_kitchen or spec.startswith(VISUAL_TASKS) or not is_there(folder):
+        kitchen = (
+            f"{SAME_SCENE!r}, {TOYS!r}, {DRAWINGS!r}, 'text' and '{VISUAL_TASKS}…' are of zest/Kitchen-v1's tasks alone"
+        )
         raise BadInput(
             f"frames from elsewhere need a goal of their own, got {spec!r} ({kitchen}); give --goal a folder with "
             "init/ and goal/ pictures, or 'text:closed drawer -> open drawer'"
