@@ -156,11 +156,9 @@ def _stove(style: _Style, done: bool) -> str:
         is_on = done and i == 0
         burners.append(_disc((x * w, y, -0.078), 0.09, 0.006, _GLOW if is_on else ".3 .3 .32"))
         knob_x = w * (-0.6 + 0.4 * i)
-        turn = f'euler="0 {50 if is_on else 0} 0"'
+        mark = _box((0, 0, 0), (0.006, 0.006, 0.03), "1 1 1")
         knobs.append(_disc((knob_x, -0.28, -0.18), 0.03, 0.02, style.handle, 'euler="90 0 0"'))
-        knobs.append(
-            f'<body pos="{_numbers((knob_x, -0.305, -0.18))}" {turn}>{_box((0, 0, 0), (0.006, 0.006, 0.03), "1 1 1")}</body>'
-        )
+        knobs.append(f'<body pos="{_numbers((knob_x, -0.305, -0.18))}" euler="0 {50 * is_on} 0">{mark}</body>')
     return top + "".join(burners + knobs)
 
 
