@@ -103,7 +103,8 @@ def test_a_damaged_environment_of_a_run_is_evaluated_or_refused(n: int, trained:
     spec = json.loads(meta["dataset"]["env_spec"]) | {"max_episode_steps": 1}
     damaged = [meta["dataset"] | {"env_spec": json.dumps(value)} for value in (spec, *damages(spec, n, rng))]
     references = {"ref_min_score": 0.0, "ref_max_score": 70.0}
-    damaged += [meta["dataset"] | {"env_spec": json.dumps(spec)} | value for value in damages(references, n // 4, rng)]
+    values = filter(lambda value: isinstance(value, dict), damages(references, n // 4, rng))
+    damaged += [meta["dataset"] | {"env_spec": json.dumps(spec)} | value for value in values]
 
     def read(i: int) -> str:
         artifacts.write_json(path, meta | {"dataset": damaged[i]})
