@@ -145,7 +145,7 @@ def test_a_recipe_becomes_datasets_policies_a_table_and_a_report(whole: Reproduc
     )
     assert written["tasks"]["micro"]["rows"] == written["rows"]
     table = (whole.output / "table.md").read_text().splitlines()
-    assert table[0] == "| | % of the expert | 95 % interval | paper |"
+    assert table[0] == "| | % of the expert | 95 % interval | success | paper |"
     assert table[4].startswith(f"| ZeST+DT | {value:.2f} | ")
     html = (whole.output / "report.html").read_text()
     assert all(part in html for part in ("A tiny comparison", "ZeST+DT", "Tiny.", "same-scene"))
@@ -385,7 +385,11 @@ evaluate = {rtg = "constant"}
         of_tasks = [result["tasks"][task]["rows"][name] for task in ("micro", "sdoor")]
         assert row["normalized_return"] == pytest.approx(np.mean([of["normalized_return"] for of in of_tasks]))
         assert row["n_episodes"] == sum(of["n_episodes"] for of in of_tasks)
-    assert (copy / "table.md").read_text().startswith("| | % of the expert | 95 % interval | micro | sdoor | paper |")
+    assert (
+        (copy / "table.md")
+        .read_text()
+        .startswith("| | % of the expert | 95 % interval | success | micro | sdoor | paper |")
+    )
     overview = (copy / "report.html").read_text()
     assert all(
         part in overview for part in ('href="micro.html"', 'href="sdoor.html"', "sdoor: scene", "over 2 datasets")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 
@@ -31,18 +31,20 @@ def as_text(result: Mapping[str, Any]) -> str:
     )
 
 
-def as_markdown(result: Mapping[str, Any]) -> str:
-    """Write the table for a README: all tasks together, then one column per task."""
-    tasks = list(result["tasks"]) if len(result["tasks"]) > 1 else []
+def as_markdown(result: Mapping[str, Any], rows: Sequence[str] = ()) -> str:
+    """Write the table for a README: all rows, with one column per task, or the named rows over all tasks alone."""
+    tasks = list(result["tasks"]) if len(result["tasks"]) > 1 and not rows else []
     lines = [
-        "| | % of the expert | 95 % interval | " + "".join(f"{task} | " for task in tasks) + "paper |",
-        "|---|---|---|" + "---|" * (len(tasks) + 1),
+        "| | % of the expert | 95 % interval | success | " + "".join(f"{task} | " for task in tasks) + "paper |",
+        "|---|---|---|---|" + "---|" * (len(tasks) + 1),
     ]
-    for name, row in result["rows"].items():
+    for name in rows or result["rows"]:
+        row = result["rows"][name]
         low, high = row["ci95"]
         by_task = (f"{result['tasks'][task]['rows'][name]['normalized_return']:.1f} | " for task in tasks)
         paper = "–" if row["paper"] is None else f"{row['paper']:.2f}"
         lines.append(
-            f"| {name} | {row['normalized_return']:.2f} | {low:.1f} to {high:.1f} | {''.join(by_task)}{paper} |"
+            f"| {name} | {row['normalized_return']:.2f} | {low:.1f} to {high:.1f} | {100 * row['success']:.0f} % | "
+            f"{''.join(by_task)}{paper} |"
         )
     return "\n".join(lines) + "\n"

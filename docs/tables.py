@@ -1,0 +1,84 @@
+"""Writes the tables of README.md, docs/results.md and eval/README.md from the committed results; run by `make tables`.
+
+What stands between two comments is written anew::
+
+    <!-- make tables: table1, rows BC | ZeST+DT -->     these rows of eval/results/table1.json, over all tasks alone
+    <!-- make tables: table1 -->                        all rows, each task, how well scores rank the episodes, the time
+    <!-- make tables: recipes -->                       every recipe of eval/: its results, or what it needs
+    <!-- end -->
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from zest_rl.cli.reproduce.tables import as_markdown
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "eval" / "results"
+PAGES = ("README.md", "docs/results.md", "eval/README.md")
+BLOCK = re.compile(r"(<!-- make tables: (\w+)(?:, rows (.+?))? -->\n).*?(?=<!-- end -->)", re.DOTALL)
+NOT_RUN = "# Not run: "
+"""Begins the line in a recipe's header that names what it needs and cannot be had with packages alone."""
+
+
+def rendered(page: str) -> str:
+    """Return the text of a page with every table as the committed results have it."""
+    return BLOCK.sub(lambda block: f"{block[1]}\n{_table(block[2], block[3])}\n", page)
+
+
+def _table(name: str, rows: str | None) -> str:
+    if name == "recipes":
+        return _recipes()
+    result = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+    if rows:
+        return f"{as_markdown(result, rows.split(' | '))}\n{_source(result)}.\n"
+    return f"{as_markdown(result)}\n{_ranks(result)}\n{_source(result)}; wall time: {result['wall_time']}.\n"
+
+
+def _ranks(result: Mapping[str, Any]) -> str:
+    """Write Spearman's ρ of ZeST and true returns over the training episodes: goals × tasks."""
+    tasks = {name: task["spearman_of_zest_and_true_returns"] for name, task in result["tasks"].items()}
+    lines = [f"| ρ of ZeST and true returns, by goal | {' | '.join(tasks)} |", "|---|" + "---|" * len(tasks)]
+    for goal in next(iter(tasks.values())):
+        found = (ranks[goal] for ranks in tasks.values())
+        cells = ("–" if rank is None else f"{rank['value']:.2f}" for rank in found)
+        lines.append(f"| {goal} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _source(result: Mapping[str, Any]) -> str:
+    *_, row = result["rows"].values()
+    per_task = row["n_episodes"] // row["n_seeds"] // len(result["tasks"])
+    provenance = result["provenance"]
+    return (
+        f"`{provenance['command']}`, revision {provenance['git_revision']}, {row['n_seeds']} training "
+        f"seed{'s' * (row['n_seeds'] > 1)} × {per_task} episodes per task"
+    )
+
+
+def _recipes() -> str:
+    lines = ["| recipe | what | results |", "|---|---|---|"]
+    for path in sorted((ROOT / "eval").glob("*.toml")):
+        header = path.read_text(encoding="utf-8").splitlines()
+        lines.append(f"| `{path.name}` | {header[0].removeprefix('# ').rstrip('.')} | {_state(path.stem, header)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _state(name: str, header: list[str]) -> str:
+    path = RESULTS / f"{name}.json"
+    if path.exists():
+        result = json.loads(path.read_text(encoding="utf-8"))
+        return f"[{result['provenance']['git_revision']}](results/{name}.json), {result['wall_time']}"
+    needs = (line.removeprefix("# ").rstrip(".") for line in header if line.startswith(NOT_RUN))
+    return next(needs, "not run yet")
+
+
+if __name__ == "__main__":
+    for page in PAGES:
+        path = ROOT / page
+        path.write_text(rendered(path.read_text(encoding="utf-8")), encoding="utf-8")

@@ -1,0 +1,42 @@
+"""The tables of README.md, docs/results.md and eval/README.md say what the committed results say."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+TABLES = runpy.run_path(str(ROOT / "docs" / "tables.py"))
+RESULTS = {path.stem: json.loads(path.read_text()) for path in sorted((ROOT / "eval" / "results").glob("*.json"))}
+COMPARISONS = [name for name, result in RESULTS.items() if "seeds" in result]
+
+
+@pytest.mark.parametrize("page", TABLES["PAGES"])
+def test_a_page_has_the_tables_that_the_committed_results_make(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    assert text == TABLES["rendered"](text), "run `make tables`"
+
+
+def test_a_figure_that_was_edited_by_hand_is_written_anew() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    edited = re.sub(r"(\| Demo \| )\d+", r"\g<1>99", text)
+    assert edited != text
+    assert TABLES["rendered"](edited) == text
+
+
+def test_every_table_of_the_results_page_is_made_and_every_comparison_has_one() -> None:
+    text = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    assert "\n|" not in TABLES["BLOCK"].sub("", text)
+    assert {block[2] for block in TABLES["BLOCK"].finditer(text)} == set(COMPARISONS)
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_committed_results_say_by_which_command_and_revision_they_were_made_and_how_long_it_took(name: str) -> None:
+    provenance = RESULTS[name]["provenance"]
+    assert f"zest reproduce eval/{name}.toml" in provenance["command"]
+    assert provenance["git_revision"]
+    assert RESULTS[name]["wall_time"]
