@@ -52,12 +52,13 @@ def _ranks(result: Mapping[str, Any]) -> str:
 
 
 def _source(result: Mapping[str, Any]) -> str:
-    *_, row = result["rows"].values()
-    per_task = row["n_episodes"] // row["n_seeds"] // len(result["tasks"])
+    trained = [row for row in result["rows"].values() if row["kind"] != "dataset"]
+    n_seeds = sorted({row["n_seeds"] for row in trained})
+    per_task = trained[0]["n_episodes"] // trained[0]["n_seeds"] // len(result["tasks"])
     provenance = result["provenance"]
     return (
-        f"`{provenance['command']}`, revision {provenance['git_revision']}, {row['n_seeds']} training "
-        f"seed{'s' * (row['n_seeds'] > 1)} × {per_task} episodes per task"
+        f"`{provenance['command']}`, revision {provenance['git_revision']}, {' to '.join(map(str, n_seeds))} training "
+        f"seed{'s' * (n_seeds[-1] > 1)} × {per_task} episodes per task"
     )
 
 
@@ -74,8 +75,8 @@ def _state(name: str, header: list[str]) -> str:
     if path.exists():
         result = json.loads(path.read_text(encoding="utf-8"))
         return f"[{result['provenance']['git_revision']}](results/{name}.json), {result['wall_time']}"
-    needs = (line.removeprefix("# ").rstrip(".") for line in header if line.startswith(NOT_RUN))
-    return next(needs, "not run yet")
+    needs = (line.removeprefix(NOT_RUN).rstrip(".") for line in header if line.startswith(NOT_RUN))
+    return f"not run: {next(needs, 'to be done')}"
 
 
 if __name__ == "__main__":
