@@ -57,3 +57,9 @@ def test_a_recipe_has_committed_results_or_says_what_it_needs_that_cannot_be_had
 
 def test_all_committed_results_are_of_a_recipe() -> None:
     assert set(RESULTS) <= set(RECIPES)
+
+
+def test_all_cells_of_committed_results_are_of_one_code() -> None:
+    for code in (RESULTS[name]["code"] for name in COMPARISONS if "code" in RESULTS[name]):  # earlier ones have none
+        assert [made["source_sha256"] for made in code["made_by"]] == [code["source_sha256"]]
+        assert code["outdated_cells"] == []

@@ -7,6 +7,7 @@ import os
 import resource
 import subprocess
 import sys
+import tomllib
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,11 +19,13 @@ import pytest
 import tyro
 
 from zest_rl import __version__, cli
-from zest_rl.cli.config import load_config, parse_config, read_recipe
+from zest_rl.cli.config import load_config, parse_config, read_recipe, recipe_path
 from zest_rl.cli.terminal import StreamUi
 from zest_rl.cli.ui import SilentUi, Ui
 from zest_rl.cli.verbs import VERBS
 from zest_rl.errors import BadInput, Notice, ZestError
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True)
@@ -407,6 +410,41 @@ def test_a_recipe_that_is_missing_or_no_toml_is_refused(tmp_path: Path) -> None:
         read_recipe(tmp_path / "tiy.toml")
     with pytest.raises(BadInput, match=r"toy\.toml is not TOML: .*line 1"):
         read_recipe(tmp_path / "toy.toml")
+
+
+@pytest.mark.parametrize(
+    ("name", "verb", "path"),
+    [
+        ("demo", "reproduce", "eval/demo.toml"),
+        ("micro", "reproduce", "eval/micro.toml"),
+        ("micro", "collect", "datasets/micro.toml"),
+        ("dt", "train dt", "train/dt.toml"),
+        ("multistep", "follow kitchen", "eval/multistep.toml"),
+    ],
+)
+def test_a_recipe_that_comes_with_the_package_goes_by_its_name_in_any_folder(
+    name: str, verb: str, path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).mkdir()
+    found = recipe_path(Path(name), verb)
+    assert found == Path(path)
+    assert read_recipe(found) == tomllib.loads((ROOT / path).read_text(encoding="utf-8"))
+    (tmp_path / name).rmdir()
+    (tmp_path / name).write_text("", encoding="utf-8")
+    assert recipe_path(Path(name), verb) == Path(name), "a file of one's own comes first"
+
+
+def test_a_wrong_name_of_a_recipe_lists_the_nearest_ones(refusal: Callable[..., tuple[int, str]]) -> None:
+    code, message = refusal("reproduce", "dmeo")
+    assert (code, "there is no recipe dmeo in eval; did you mean 'demo'" in message) == (2, True)
+    code, message = refusal("collect", "--recipe", "mixd")
+    assert (code, "there is no recipe mixd in datasets; did you mean 'mixed'" in message) == (2, True)
+
+
+def test_a_recipe_by_its_name_gives_the_arguments_of_a_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["collect", "--recipe", "micro", "--help"]) == 0
+    assert "0.5391" in capsys.readouterr().out
 
 
 def test_a_config_can_be_built_from_a_table_alone() -> None:

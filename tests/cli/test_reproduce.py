@@ -20,6 +20,7 @@ from read_dataset import read
 
 from zest_rl import cli
 from zest_rl.cli import reproduce
+from zest_rl.cli.reproduce import code
 from zest_rl.cli.reproduce.cells import TaskDatasets, make_cells
 from zest_rl.cli.reproduce.comparison import read_comparison
 from zest_rl.data import reader
@@ -170,6 +171,7 @@ def test_a_second_run_finds_everything_done_and_says_so(
     result = again()
     assert result["n_cells_run"] == 0
     assert result["rows"] == whole.result["rows"]
+    assert result["seconds_by_stage"] == whole.result["seconds_by_stage"], "of the commands that had work to do"
     cli.main(["reproduce", str(whole.recipe), "--output", str(tmp_path / "copy"), "--n-workers", "1"])
     out, err = capsys.readouterr()
     assert "all cells were done already" in err
@@ -192,6 +194,9 @@ def test_a_deleted_cell_is_run_again_alone_and_to_the_same_numbers(
     traces = [methods.latest_evaluation(folder).traces for folder in (gone, cell(whole.output, "dt"))]
     np.testing.assert_array_equal(traces[0]["qpos"], traces[1]["qpos"])
     assert kept.stat().st_mtime_ns == before
+    first, sums = whole.result["seconds_by_stage"], result["seconds_by_stage"]
+    assert list(first) == list(sums) == ["collect", "relabel", "train and evaluate", "report"]
+    assert all(sums[stage] > first[stage] > 0 for stage in ("train and evaluate", "report"))
 
 
 def test_a_deleted_evaluation_of_a_snapshot_is_run_again(again: Callable[[], dict[str, Any]], tmp_path: Path) -> None:
@@ -255,6 +260,102 @@ def test_the_flags_of_a_method_win_over_those_of_its_agent_and_these_over_the_sh
     ], "all of the first seed come first"  # fmt: skip
 
 
+def test_a_method_may_have_fewer_seeds_than_the_others(
+    whole: Reproduced, tmp_path: Path, zest: Callable[..., dict[str, Any]]
+) -> None:
+    text = RECIPE.replace("seeds = [0]", "seeds = [0, 1]").replace('"bc"', '"bc"\nseeds = [0]')
+    copy = shutil.copytree(whole.output, tmp_path / "copy")
+    result = zest("reproduce", write(tmp_path, text), "--output", copy, "--n-workers", "1")
+    assert result["n_cells_run"] == 1, "the other two are done"
+    seeds_and_episodes = {name: (row["n_seeds"], row["n_episodes"]) for name, row in result["rows"].items()}
+    assert seeds_and_episodes == {"Demo": (1, 4), "BC": (1, 2), "ZeST+DT": (2, 4)}
+    assert result["rows"]["BC"] == whole.result["rows"]["BC"]
+    header, _, demo, bc, dt = (copy / "table.md").read_text().splitlines()
+    assert header == "| | % of the expert | 95 % interval | success | seeds | paper |"
+    assert [line.split(" | ")[4] for line in (demo, bc, dt)] == ["–", "1", "2"]
+
+
+OLD = {"agents/dt.py": "0" * 64, "agents/gone.py": "0" * 64}
+"""Hashes of files at another time."""
+
+
+def of_other_code(output: Path, agent: str) -> Path:
+    """Make a finished cell one of other code, of another revision."""
+    run = cell(output, agent)
+    (evaluated,) = (output / "code").glob(f"{run.name}-*.json")
+    for path in (output / "code" / f"{run.name}.json", evaluated):
+        files = artifacts.read_json(path)[0]["files"]
+        artifacts.write_json(path, [{"files": {**files, **OLD}, "git_revision": "abc"}])
+    return run
+
+
+def test_results_of_one_code_name_it(whole: Reproduced) -> None:
+    made = artifacts.read_json(whole.output / "result.json")["code"]
+    now = code.code_now()
+    assert {"types.py", "agents/dt.py", "training/loop.py", "kitchen/env.py"} <= now.files.keys()
+    assert not [path for path in now.files if path.startswith(("cli", "report", "analysis", "export"))]
+    about_now = {"source_sha256": now.sha256, "git_revision": now.git_revision}
+    revisions = [now.git_revision] if now.git_revision else []
+    by_now = {"source_sha256": now.sha256, "git_revisions": revisions, "n_cells": 2, "changed_files": []}
+    assert made == {**about_now, "made_by": [by_now], "outdated_cells": []}
+    assert "made by other code" not in (whole.output / "report.html").read_text()
+
+
+def test_cells_of_other_code_are_used_named_and_run_anew_if_that_is_asked(
+    whole: Reproduced,
+    tmp_path: Path,
+    zest: Callable[..., dict[str, Any]],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    copy = shutil.copytree(whole.output, tmp_path / "copy")
+    run = of_other_code(copy, "dt")
+    words = ["reproduce", str(whole.recipe), "--output", str(copy), "--n-workers", "1"]
+    result = zest(*words)
+    assert (result["n_cells_run"], result["rows"]) == (0, whole.result["rows"])
+    (outdated,) = result["code"]["outdated_cells"]
+    assert outdated.startswith(run.name)
+    first, other = result["code"]["made_by"]
+    assert (first["n_cells"], other["n_cells"], other["git_revisions"]) == (1, 1, ["abc"])
+    assert other["changed_files"] == ["agents/dt.py", "agents/gone.py"]
+    told = (
+        "Of 2 cells 1 were made by other code than the present (changed since: agents/dt.py, agents/gone.py): "
+        f"{outdated}. The same command with --rerun-outdated deletes them and runs them anew."
+    )
+    assert told in (copy / "report.html").read_text()
+    cli.main(words)
+    assert told in capsys.readouterr().err.replace("\n", " ")
+    policy, kept = (cell(copy, agent) / "meta.json" for agent in ("dt", "bc"))
+    before = policy.stat().st_mtime_ns, kept.stat().st_mtime_ns
+    anew = zest(*words, "--rerun-outdated")
+    assert (anew["n_cells_run"], anew["rows"], anew["code"]) == (1, whole.result["rows"], whole.result["code"])
+    assert policy.stat().st_mtime_ns > before[0]
+    assert kept.stat().st_mtime_ns == before[1]
+    assert zest(*words, "--rerun-outdated")["n_cells_run"] == 0
+
+
+def test_a_training_that_other_code_began_counts_for_both(
+    whole: Reproduced, again: Callable[[], dict[str, Any]], tmp_path: Path
+) -> None:
+    run = of_other_code(tmp_path / "copy", "dt")
+    (run / "meta.json").unlink()
+    result = again()
+    assert result["n_cells_run"] == 1
+    assert [made["n_cells"] for made in result["code"]["made_by"]] == [2, 1]
+    assert [name.rpartition("-")[0] for name in result["code"]["outdated_cells"]] == [run.name]
+
+
+def test_cells_of_versions_that_recorded_no_code_are_told_with_the_revision_of_their_policies(
+    whole: Reproduced, again: Callable[[], dict[str, Any]], tmp_path: Path
+) -> None:
+    shutil.rmtree(tmp_path / "copy" / "code")
+    made = again()["code"]
+    revision = artifacts.read_json(cell(whole.output, "dt") / "meta.json")["made_by"]["git_revision"]
+    revisions = [revision] if revision else []
+    assert made["made_by"] == [{"source_sha256": None, "git_revisions": revisions, "n_cells": 2, "changed_files": None}]
+    assert len(made["outdated_cells"]) == 2
+    assert "a version that did not record it" in (tmp_path / "copy" / "report.html").read_text()
+
+
 def test_a_policy_that_was_trained_elsewhere_is_a_method_like_the_others(
     whole: Reproduced,
     refusal: Callable[..., tuple[int, str]],
@@ -305,6 +406,8 @@ def test_one_task_may_have_several_datasets(tmp_path: Path) -> None:
         ('title = "A tiny comparison"', 'verb = "select goals"', "unknown key 'collect'"),
         ("seeds = [0]", 'seeds = ["0"]', "'seeds' must be a list of an integer, got ['0']"),
         ("seeds = [0]", "seeds = [0, 0]", "seeds must be at least 1 number, all different"),
+        ('agent = "bc"', 'agent = "bc"\nseeds = [1]', "seeds must be some of the recipe's seeds [0], got [1]"),
+        ('agent = "bc"', 'agent = "bc"\nseeds = []', "[methods.'BC']: seeds must be some of"),
         ("[relabel]", "[relabel.all]", "[goals.'scene']: unknown key 'all'"),
         ("[methods.BC]", "[methods]", "'methods' must be a table of tables"),
         ("[train.dt]", "[train.bcc]", "unknown key 'bcc'"),

@@ -35,7 +35,7 @@ C = TypeVar("C", bound="DataclassInstance")
 RECIPE_FOLDERS = ("datasets", "train", "eval")
 
 COMMON_FLAGS = """every verb also takes:
-  --recipe FILE.toml  defaults for the arguments, by name; flags win
+  --recipe FILE.toml  defaults for the arguments, by name; flags win; NAME alone: a recipe of the package
   --json              print the result as one JSON document on stdout"""
 
 
@@ -61,6 +61,23 @@ def read_recipe(path: Path) -> dict[str, Any]:
         return tomllib.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise BadInput(f"recipe {path} is not TOML: {error}") from error
+
+
+def recipe_path(given: Path, verb: str) -> Path:
+    """Return the path of a recipe that may be given by name: ``demo`` of `zest reproduce` is ``eval/demo.toml``.
+
+    Raises:
+        BadInput: no recipe of that name comes with the package.
+    """
+    from zest_rl.runtime.artifacts import shipped
+
+    if len(given.parts) != 1 or given.suffix or given.is_file():
+        return given
+    folder = {"collect": "datasets", "train": "train"}.get(verb.split()[0], "eval")
+    names = {path.stem for place in (Path(folder), shipped(folder)) for path in place.glob("*.toml")}
+    if given.name not in names:
+        raise BadInput(f"there is no recipe {given} in {folder}; {nearest(given.name, names)}")
+    return Path(folder, f"{given}.toml")
 
 
 def expand_variables(path: Path) -> Path:
@@ -104,17 +121,18 @@ def parse_config(config_class: type[C], argv: Sequence[str], verb: str) -> tuple
         SystemExit: code 0, after ``--help`` was printed.
     """
     given, problems, last = _split_words(config_class, argv)
-    as_json, asks_for_help, recipe_path = (given.pop(flag, None) for flag in ("--json", "--help", "--recipe"))
+    as_json, asks_for_help, recipe_words = (given.pop(flag, None) for flag in ("--json", "--help", "--recipe"))
     values: dict[str, Any] = {}
-    if recipe_path is not None:
-        if not any(recipe_path):
+    if recipe_words is not None:
+        if not any(recipe_words):
             _refuse([*problems, "--recipe needs a file: --recipe FILE.toml"], f"zest {verb}")
-        recipe = read_recipe(Path(recipe_path[0]))
+        path = recipe_path(Path(recipe_words[0]), verb)
+        recipe = read_recipe(path)
         meant = recipe.pop("verb", verb)
         if meant != verb:
-            raise BadInput(f"recipe {recipe_path[0]} is for `zest {meant}`, not for `zest {verb}`")
+            raise BadInput(f"recipe {path} is for `zest {meant}`, not for `zest {verb}`")
         values, recipe_problems = _read_table(config_class, recipe)
-        _refuse(recipe_problems, f"recipe {recipe_path[0]}")
+        _refuse(recipe_problems, f"recipe {path}")
     if asks_for_help is not None:
         _print_help(config_class, verb, values)
     arguments = _arguments(config_class)

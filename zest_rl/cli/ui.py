@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import Protocol
 
@@ -59,6 +59,12 @@ def progress_in_parts(ui: Ui, description: str) -> Iterator[Callable[[int, int],
             shown = percent
 
         yield on_progress
+
+
+def shortened(names: Sequence[str], n: int = 6) -> str:
+    """Join names, all but the first `n` as a number."""
+    more = [f"and {len(names) - n} more"] if len(names) > n else []
+    return ", ".join([*names[:n], *more])
 
 
 def joined(fields: dict[str, object]) -> str:

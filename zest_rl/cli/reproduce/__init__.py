@@ -2,7 +2,7 @@
 
 What a recipe may hold is drawn in `comparison`, and in `study` for what trains nothing; with a key
 ``verb = "follow …"`` or ``"select …"`` it holds the arguments of that verb. Cells run side by side, one core each; a
-finished cell is never run again.
+finished cell is run again only if that is asked, because other code made it (`code`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import tyro
 
 from zest_rl.cli import follow, inspect, select
-from zest_rl.cli.config import load_config, read_recipe
+from zest_rl.cli.config import load_config, read_recipe, recipe_path
 from zest_rl.cli.reproduce import study_tables, tables
 from zest_rl.cli.reproduce.comparison import read_comparison
 from zest_rl.cli.reproduce.pipeline import run_comparison
@@ -36,30 +36,40 @@ VERBS = {
 class Config:
     """Reproduce a whole comparison from a recipe; rerun the same command to go on or to find everything done."""
 
-    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECIPE.toml")]
-    """Recipe, e.g. eval/demo.toml."""
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECIPE")]
+    """A recipe that comes with the package, by its name (demo), or a file (eval/demo.toml)."""
     output: Path | None = None
     """Folder of runs, result.json, table.md and report.html; default runs/RECIPE."""
     n_workers: int | None = None
     """Cells side by side; default one per core."""
+    rerun_outdated: bool = False
+    """Delete cells that other code than now's has made, and run them anew."""
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Run all stages that are not done yet."""
     started = time.monotonic()
-    result = reproduce(config.file, config.output, n_workers=config.n_workers, ui=ui)
+    result = reproduce(
+        config.file, config.output, n_workers=config.n_workers, rerun_outdated=config.rerun_outdated, ui=ui
+    )
     return {**result, "seconds": round(time.monotonic() - started, 1)}
 
 
 def reproduce(
-    file: Path, output: Path | None = None, *, n_workers: int | None = None, ui: Ui | None = None
+    file: Path,
+    output: Path | None = None,
+    *,
+    n_workers: int | None = None,
+    rerun_outdated: bool = False,
+    ui: Ui | None = None,
 ) -> dict[str, Any]:
     """Reproduce a comparison, a study or what a verb does from a recipe; what is done already is not done again.
 
     Args:
-        file: the recipe; ``eval/demo.toml`` and its like come with the package.
+        file: the recipe; ``eval/demo.toml`` and its like come with the package, and ``demo`` alone will do.
         output: folder of runs, result.json, table.md and report.html; default runs/RECIPE.
         n_workers: cells side by side, default one per core.
+        rerun_outdated: delete cells that other code than now's has made, and run them anew.
         ui: told what happens; default nobody.
 
     Returns:
@@ -72,6 +82,7 @@ def reproduce(
     from zest_rl.runtime import artifacts
 
     ui = SilentUi() if ui is None else ui
+    file = recipe_path(file, "reproduce")
     output = output or Path("runs") / file.stem
     recipe = read_recipe(file)
     work: Callable[[], dict[str, Any]]
@@ -80,7 +91,15 @@ def reproduce(
     elif "study" in recipe:
         work = partial(run_study, read_study(file), output, ui, n_workers=n_workers)
     else:
-        work = partial(run_comparison, read_comparison(file), file.name, output, ui, n_workers=n_workers)
+        work = partial(
+            run_comparison,
+            read_comparison(file),
+            file.name,
+            output,
+            ui,
+            n_workers=n_workers,
+            rerun_outdated=rerun_outdated,
+        )
     with artifacts.lock(output):
         return work()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from zest_rl.cli.config import load_config
+from zest_rl.cli.reproduce import code
 from zest_rl.cli.reproduce.comparison import Comparison, run_config
 from zest_rl.cli.ui import Ui
 from zest_rl.errors import BadInput
@@ -61,6 +63,12 @@ class Cell:
 
         return f"{self.run.name}-{hash_json({**self.evaluate, 'run': '', 'n_workers': 1})[:8]}"
 
+    @property
+    def code_records(self) -> tuple[Path, Path]:
+        """Which code trained the policy, which cells may share, and which evaluated it."""
+        folder = self.run.parents[1] / "code"
+        return folder / f"{self.run.name}.json", folder / f"{self.name}.json"
+
 
 def make_cells(comparison: Comparison, datasets: Mapping[str, TaskDatasets], output: Path) -> list[Cell]:
     """Return one cell per task, method and seed; the run's folder is named by a hash of its data and all arguments.
@@ -81,6 +89,8 @@ def make_cells(comparison: Comparison, datasets: Mapping[str, TaskDatasets], out
     cells, problems = [], []
     triples = product(comparison.tables.seeds, comparison.methods.items(), datasets.items())
     for seed, (name, method), (task, task_datasets) in triples:
+        if seed not in method.seeds:
+            continue
         goal, agent = method.table.goal, method.table.agent_or_foreign
         dataset = task_datasets.source if goal is None else task_datasets.relabeled[goal]
         train = {**method.train, "dataset": dataset, "seed": seed}
@@ -102,11 +112,16 @@ def make_cells(comparison: Comparison, datasets: Mapping[str, TaskDatasets], out
     return cells
 
 
-def run_cells(cells: list[Cell], output: Path, ui: Ui, *, n_workers: int | None = None) -> int:
-    """Train and evaluate all cells that are not done; return how many were not."""
+def run_cells(
+    cells: list[Cell], output: Path, ui: Ui, *, n_workers: int | None = None, rerun_outdated: bool = False
+) -> int:
+    """Train and evaluate all cells that are not done, or that other code made if that is asked; return how many."""
     from zest_rl.runtime.parallel import cached_jobs
 
     done_folder = output / "done"
+    for cell in cells if rerun_outdated else ():
+        if cell.run.exists() and code.is_outdated(cell):
+            shutil.rmtree(cell.run)
     open_cells = {cell.name: cell for cell in cells if not _is_done(cell, done_folder)}
     n_updates = {cell.run: cell.train.get("n_updates", 0) for cell in open_cells.values()}
     with (
@@ -137,11 +152,15 @@ def _train_and_evaluate(cell: Cell) -> dict[str, NDArray[np.float64]]:
     from zest_rl.agents.foreign import FOREIGN
     from zest_rl.cli.evaluate import Config as EvaluateFlags
     from zest_rl.cli.train import split_config
-    from zest_rl.evaluation.evaluate import evaluate
+    from zest_rl.evaluation.evaluate import evaluate, evaluation_folder
     from zest_rl.training.adoption import adopt
     from zest_rl.training.checkpoints import snapshots
     from zest_rl.training.runs import train
 
+    training_code, evaluation_code = cell.code_records
+    if not (cell.run / "meta.json").exists():
+        code.record(training_code, cell.run)
+    code.record(evaluation_code, evaluation_folder(cell.run, cell.evaluation))
     flags = load_config(run_config(cell.agent), cell.train, cell.method)
     if cell.agent == FOREIGN:
         adopt(flags.policy, flags.dataset, name=flags.name, seed=flags.seed, python=flags.python, run_dir=flags.run_dir)

@@ -14,7 +14,8 @@ A recipe has these tables (keys are the flags of the verb)::
     [train.AGENT]                   `zest train AGENT`, for all methods with this agent
     [evaluate]                      `zest evaluate`, for all methods
     [methods."NAME"]                agent = "dt", goal = "NAME" (left out: ground-truth rewards), kind, note, paper,
-                                    evaluate = {…} of this method alone, and the agent's own flags
+                                    evaluate = {…} of this method alone, seeds = […] if not all of them, and the
+                                    agent's own flags
     [methods."NAME"]                policy = "torchscript:FILE" in place of the agent: `zest adopt`; {task} and {seed}
                                     stand for those of the cell, and goal says on whose rewards it was trained
 
@@ -74,6 +75,8 @@ class MethodTable:
     note: str = ""
     paper: float | None = None
     evaluate: dict[str, Any] = field(default_factory=dict)
+    seeds: tuple[int, ...] | None = None
+    """Those of the recipe's that it is trained with; None: all."""
 
     def __post_init__(self) -> None:
         if (self.agent is None) == (self.policy is None):
@@ -92,6 +95,7 @@ class MethodArguments:
     """What one row of the results is made with."""
 
     table: MethodTable
+    seeds: tuple[int, ...]
     train: Mapping[str, Any]
     """Arguments of `zest train AGENT` or `zest adopt`; dataset and seed are added per cell."""
     evaluate: Mapping[str, Any]
@@ -203,9 +207,12 @@ def _read_method(
             get_agent(table.agent)
     if table.goal is not None and table.goal not in goals:
         raise BadInput(f"{where}: unknown goal {table.goal!r}; {nearest(table.goal, goals)}")
+    seeds = tables.seeds if table.seeds is None else table.seeds
+    if not seeds or not set(seeds) <= set(tables.seeds):
+        raise BadInput(f"{where}: seeds must be some of the recipe's seeds {list(tables.seeds)}, got {list(seeds)}")
     train: dict[str, Any]
     if table.policy is not None:
-        _check_policy(tables, table.policy, flags.get("python"), where)
+        _check_policy(tables, seeds, table.policy, flags.get("python"), where)
         train = {"policy": table.policy, **checked_table(flags, where, "dataset", "seed", "run_dir", "name")}
     else:
         by_agent = {key: value for key, value in tables.train.items() if key in AGENTS and isinstance(value, dict)}
@@ -218,14 +225,16 @@ def _read_method(
     config = load_config(evaluate.Config, {**arguments, "run": ""}, f"{where} [evaluate]")
     with located(f"{where} [evaluate]"):
         evaluation = evaluate.settings(config)
-    return MethodArguments(table, train, {"n_workers": 1, **arguments}, evaluation)
+    return MethodArguments(table, seeds, train, {"n_workers": 1, **arguments}, evaluation)
 
 
-def _check_policy(tables: ComparisonTables, policy: str, python: str | None, where: str) -> None:
+def _check_policy(
+    tables: ComparisonTables, seeds: tuple[int, ...], policy: str, python: str | None, where: str
+) -> None:
     """Check how a policy from elsewhere is named; its files may be trained on the data that are made first."""
     from zest_rl.agents.foreign import parse
 
-    if len(tables.seeds) > 1 and "{seed}" not in policy:
+    if len(seeds) > 1 and "{seed}" not in policy:
         raise BadInput(f"{where}: with several seeds the policy must hold {{seed}}, got {policy!r}")
     if len(tables.tasks) > 1 and "{task}" not in policy:
         raise BadInput(f"{where}: with several tasks the policy must hold {{task}}, got {policy!r}")

@@ -8,8 +8,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from zest_rl.cli.reproduce import code
 from zest_rl.cli.reproduce.cells import Cell, TaskDatasets, make_cells, run_cells, seconds_of
 from zest_rl.cli.reproduce.comparison import Comparison
+from zest_rl.cli.reproduce.stopwatch import Stopwatch
 from zest_rl.cli.reproduce.tables import as_markdown
 from zest_rl.cli.ui import Ui
 
@@ -20,7 +22,13 @@ if TYPE_CHECKING:
 
 
 def run_comparison(
-    comparison: Comparison, recipe: str, output: Path, ui: Ui, *, n_workers: int | None = None
+    comparison: Comparison,
+    recipe: str,
+    output: Path,
+    ui: Ui,
+    *,
+    n_workers: int | None = None,
+    rerun_outdated: bool = False,
 ) -> dict[str, Any]:
     """Collect, relabel, train, evaluate and report what is not done yet; `recipe` is the name of the recipe's file."""
     from zest_rl.cli import inspect
@@ -28,7 +36,8 @@ def run_comparison(
     from zest_rl.report.html import write_report
     from zest_rl.runtime import artifacts
 
-    datasets = {task: _make_datasets(comparison, task, n_workers, ui) for task in comparison.collect}
+    stopwatch, was_finished = Stopwatch(output / "seconds.json"), (output / "report.html").exists()
+    datasets = {task: _make_datasets(comparison, task, n_workers, stopwatch, ui) for task in comparison.collect}
     if not comparison.methods:
         relabeled = tuple(
             dataset_id for task_datasets in datasets.values() for dataset_id in task_datasets.relabeled.values()
@@ -38,35 +47,46 @@ def run_comparison(
         return inspected
     cells = make_cells(comparison, datasets, output)
     ui.say(f"[3/4] train and evaluate {len(cells)} cells in {output / 'cells'}")
-    n_run = run_cells(cells, output, ui, n_workers=n_workers)
+    with stopwatch.stage("train and evaluate"):
+        n_run = run_cells(cells, output, ui, n_workers=n_workers, rerun_outdated=rerun_outdated)
+    made_by = code.describe(cells)
+    for sentence in (about_code := code.caveats(made_by, len(cells))):
+        ui.warn(sentence)
     ui.say("[4/4] report")
-    videos: list[Video] = []
-    details = {"recipe": {"file": recipe, **asdict(comparison.tables)}}
-    task_pages, page = _pages(comparison, cells, datasets, details, videos)
-    result = {
-        "rows": _rows(page),
-        "tasks": {
-            task: {
-                "rows": _rows(task_page),
-                "spearman_of_zest_and_true_returns": _rank_correlations(task_page),
-                "dataset": datasets[task].collect_result,
-            }
-            for task, task_page in task_pages.items()
-        },
-        "seeds": list(comparison.tables.seeds),
-        "seconds_by_cell": {cell.name: seconds_of(cell, output) for cell in cells},
-        "provenance": artifacts.provenance(),
-    }
-    artifacts.write_json(output / "result.json", result)
-    artifacts.write_bytes(output / "table.md", as_markdown(result).encode())
-    with ui.progress("videos", len(missing(videos))) as advance:
-        ensure_videos(videos, n_workers=n_workers, on_done=advance)
-    if len(task_pages) > 1:
-        for task, task_page in task_pages.items():
-            write_report(task_page, output / f"{task}.html")
-    html = write_report(page, output / "report.html")
+    with stopwatch.stage("report"):
+        videos: list[Video] = []
+        details = {"recipe": {"file": recipe, **asdict(comparison.tables)}, "code": made_by}
+        task_pages, page = _pages(comparison, cells, datasets, details, about_code, videos)
+        result = {
+            "summary": page.summary,
+            "rows": _rows(page),
+            "tasks": {
+                task: {
+                    "rows": _rows(task_page),
+                    "spearman_of_zest_and_true_returns": _rank_correlations(task_page),
+                    "dataset": datasets[task].collect_result,
+                }
+                for task, task_page in task_pages.items()
+            },
+            "seeds": list(comparison.tables.seeds),
+            "seconds_by_cell": {cell.name: seconds_of(cell, output) for cell in cells},
+            "code": made_by,
+            "provenance": artifacts.provenance(),
+        }
+        artifacts.write_json(output / "result.json", result)
+        artifacts.write_bytes(output / "table.md", as_markdown(result).encode())
+        with ui.progress("videos", len(missing(videos))) as advance:
+            ensure_videos(videos, n_workers=n_workers, on_done=advance)
+        if len(task_pages) > 1:
+            for task, task_page in task_pages.items():
+                write_report(task_page, output / f"{task}.html")
+        html = write_report(page, output / "report.html")
     if n_run == 0:
         ui.say("all cells were done already")
+        if was_finished:
+            stopwatch.discard()
+    result["seconds_by_stage"] = stopwatch.seconds
+    artifacts.write_json(output / "result.json", result)
     return {
         **result,
         "report": str(html),
@@ -76,16 +96,20 @@ def run_comparison(
     }
 
 
-def _make_datasets(comparison: Comparison, task: str, n_workers: int | None, ui: Ui) -> TaskDatasets:
+def _make_datasets(
+    comparison: Comparison, task: str, n_workers: int | None, stopwatch: Stopwatch, ui: Ui
+) -> TaskDatasets:
     """Collect and relabel."""
     from zest_rl.cli import collect, relabel
 
     ui.say(f"[1/4] collect {task}")
-    collected = collect.run(replace(comparison.collect[task], n_workers=n_workers), ui)
+    with stopwatch.stage("collect"):
+        collected = collect.run(replace(comparison.collect[task], n_workers=n_workers), ui)
     relabeled = {}
     for name, config in comparison.relabel.items():
         ui.say(f"[2/4] relabel {task} by goal {name!r}")
-        made = relabel.run(replace(config, dataset=collected["dataset"], n_workers=n_workers), ui)
+        with stopwatch.stage("relabel"):
+            made = relabel.run(replace(config, dataset=collected["dataset"], n_workers=n_workers), ui)
         relabeled[name] = made["dataset"]
     facts = {key: value for key, value in collected.items() if key not in ("path", "next")}
     return TaskDatasets(collected["dataset"], relabeled, facts)
@@ -96,6 +120,7 @@ def _pages(
     cells: Sequence[Cell],
     datasets: Mapping[str, TaskDatasets],
     details: dict[str, Any],
+    about_code: Sequence[str],
     videos: list[Video],
 ) -> tuple[dict[str, Report], Report]:
     """Build the page of each task, and the one over all; `videos` takes up what they show and nobody has written."""
@@ -106,7 +131,7 @@ def _pages(
         return video.path
 
     tables = comparison.tables
-    shared: dict[str, Any] = {"paper_demo": tables.paper_demo, "caveats": tables.caveats}
+    shared: dict[str, Any] = {"paper_demo": tables.paper_demo, "caveats": [*tables.caveats, *about_code]}
     methods = {task: _methods(comparison, cells, task) for task in datasets}
     pages = {
         task: compare(

@@ -32,19 +32,21 @@ def as_text(result: Mapping[str, Any]) -> str:
 
 
 def as_markdown(result: Mapping[str, Any], rows: Sequence[str] = ()) -> str:
-    """Write the table for a README: all rows, with one column per task, or the named rows over all tasks alone."""
+    """Write the table for a README: all rows, with one column per task, or the named rows over all tasks alone.
+
+    There is a column of seeds where methods differ in them.
+    """
     tasks = list(result["tasks"]) if len(result["tasks"]) > 1 and not rows else []
-    lines = [
-        "| | % of the expert | 95 % interval | success | " + "".join(f"{task} | " for task in tasks) + "paper |",
-        "|---|---|---|---|" + "---|" * (len(tasks) + 1),
-    ]
-    for name in rows or result["rows"]:
-        row = result["rows"][name]
+    shown = {name: result["rows"][name] for name in rows or result["rows"]}
+    with_seeds = len({row["n_seeds"] for row in shown.values() if row["kind"] != "dataset"}) > 1
+    columns = ["% of the expert", "95 % interval", "success", *tasks, *(["seeds"] if with_seeds else []), "paper"]
+    lines = [f"| | {' | '.join(columns)} |", "|---|" + "---|" * len(columns)]
+    for name, row in shown.items():
         low, high = row["ci95"]
-        by_task = (f"{result['tasks'][task]['rows'][name]['normalized_return']:.1f} | " for task in tasks)
-        paper = "–" if row["paper"] is None else f"{row['paper']:.2f}"
-        lines.append(
-            f"| {name} | {row['normalized_return']:.2f} | {low:.1f} to {high:.1f} | {100 * row['success']:.0f} % | "
-            f"{''.join(by_task)}{paper} |"
-        )
+        cells = [f"{row['normalized_return']:.2f}", f"{low:.1f} to {high:.1f}", f"{100 * row['success']:.0f} %"]
+        cells += [f"{result['tasks'][task]['rows'][name]['normalized_return']:.1f}" for task in tasks]
+        if with_seeds:
+            cells.append("–" if row["kind"] == "dataset" else str(row["n_seeds"]))
+        cells.append("–" if row["paper"] is None else f"{row['paper']:.2f}")
+        lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
