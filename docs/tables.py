@@ -37,7 +37,7 @@ def _table(name: str, rows: str | None) -> str:
     result = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
     if rows:
         return f"{as_markdown(result, rows.split(' | '))}\n{_source(result)}.\n"
-    return f"{as_markdown(result)}\n{_ranks(result)}\n{_source(result)}; wall time: {result['wall_time']}.\n"
+    return f"{as_markdown(result)}\n{_ranks(result)}\n{_source(result)}; wall time: {wall_time(result)}.\n"
 
 
 def _ranks(result: Mapping[str, Any]) -> str:
@@ -62,6 +62,12 @@ def _source(result: Mapping[str, Any]) -> str:
     )
 
 
+def wall_time(result: Mapping[str, Any]) -> str:
+    """Return how long each stage took, where that was measured, and what was noted by hand."""
+    stages = [f"{stage} {seconds / 60:.1f} min" for stage, seconds in result.get("seconds_by_stage", {}).items()]
+    return ", ".join([*stages, *([result["wall_time"]] if "wall_time" in result else [])])
+
+
 def _recipes() -> str:
     lines = ["| recipe | what | results |", "|---|---|---|"]
     for path in sorted((ROOT / "eval").glob("*.toml")):
@@ -74,7 +80,7 @@ def _state(name: str, header: list[str]) -> str:
     path = RESULTS / f"{name}.json"
     if path.exists():
         result = json.loads(path.read_text(encoding="utf-8"))
-        return f"[{result['provenance']['git_revision']}](results/{name}.json), {result['wall_time']}"
+        return f"[{result['provenance']['git_revision']}](results/{name}.json), {wall_time(result)}"
     needs = (line.removeprefix(NOT_RUN).rstrip(".") for line in header if line.startswith(NOT_RUN))
     return f"not run: {next(needs, 'to be done')}"
 

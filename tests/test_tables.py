@@ -42,11 +42,18 @@ def test_every_table_of_the_results_page_is_made_and_every_comparison_has_one() 
 
 
 @pytest.mark.parametrize("name", RESULTS)
-def test_committed_results_say_by_which_command_and_revision_they_were_made_and_how_long_it_took(name: str) -> None:
-    provenance = RESULTS[name]["provenance"]
-    assert f"zest reproduce eval/{name}.toml" in provenance["command"]
-    assert provenance["git_revision"]
-    assert RESULTS[name]["wall_time"]
+def test_committed_results_are_of_one_code_and_say_by_which_command_and_how_long(name: str) -> None:
+    result = RESULTS[name]
+    assert re.search(rf"zest reproduce (eval/{name}\.toml|{name})\b", result["provenance"]["command"])
+    assert result["provenance"]["git_revision"]
+    assert TABLES["wall_time"](result), "measured by stage, or noted by hand under `wall_time`"
+    assert not result.get("code", {}).get("outdated_cells")
+
+
+def test_the_wall_time_is_that_of_the_stages_and_what_was_noted() -> None:
+    measured = {"seconds_by_stage": {"collect": 90.0, "train and evaluate": 5400.0}}
+    assert TABLES["wall_time"](measured) == "collect 1.5 min, train and evaluate 90.0 min"
+    assert TABLES["wall_time"]({**measured, "wall_time": "2 cores"}).endswith("90.0 min, 2 cores")
 
 
 @pytest.mark.parametrize("name", RECIPES)
