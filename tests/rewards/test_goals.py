@@ -88,7 +88,8 @@ def test_a_damaged_picture_is_refused_by_its_name(folder: Path) -> None:
 @pytest.mark.parametrize("spec", ["/no/such/folder", "drawing", "same_scene", "visual-tasks"])
 def test_a_goal_that_is_nothing_known_is_refused_with_all_the_kinds(spec: str) -> None:
     expected = (
-        rf"unknown goal '{spec}': .*'same-scene', 'drawings', 'visual-tasks:real_imgs', 'text', 'text:START -> GOAL'"
+        rf"unknown goal '{spec}': .*'same-scene', 'toys', 'drawings', 'visual-tasks:real_imgs', "
+        "'text', 'text:START -> GOAL'"
     )
     with pytest.raises(BadInput, match=expected):
         read_goal(spec, MICRO)

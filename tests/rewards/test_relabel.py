@@ -425,7 +425,7 @@ def test_nothing_flows_from_the_ground_truth_into_rewards_or_policies(
         (["../tiny-v0"], "there is no file or folder ../tiny-v0; give .* or a Minari id"),
         ([SOURCE, "--embedder", "efficientnet-lite"], "unknown embedder.*did you mean 'efficientnet-lite0'"),
         ([SOURCE, "--embedder", "timm:resnet10t@/none.pth"], "/none.pth does not exist"),
-        ([SOURCE, "--goal", "drawing"], "unknown goal 'drawing': it is neither 'same-scene', 'drawings'"),
+        ([SOURCE, "--goal", "drawing"], "unknown goal 'drawing': it is neither 'same-scene', 'toys', 'drawings'"),
         (
             [SOURCE, "--goal", "text:closed -> open"],
             "'efficientnet-lite0' reads pictures only; use one that reads",

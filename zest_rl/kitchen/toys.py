@@ -1,8 +1,8 @@
 """Toy scenes of the kitchen's tasks: simple shapes before and after, rendered as goal pictures from another domain.
 
-No robot, no kitchen, no picture file: a microwave, cupboards and a stove of boxes and cylinders. What makes them work is
-how they are seen, chosen on development data (docs/findings.md): from the front, so that the open door does not hide
-what it opens; near and far, so that no distance decides; opened as far as the task demands; in several colours.
+No robot, no kitchen, no picture file: a microwave, cupboards and a stove of boxes and cylinders. What makes them work,
+chosen on development data (docs/findings.md): they are seen from the front, near and far, from the heights that the
+task is seen from, and opened as far as it demands; cupboards stand empty in a row; a stove shows its knobs, too.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from zest_rl.types import Frame
 
 _SIZE = 224
 _FRONT = 90.0  # azimuth in degrees
-_ELEVATIONS = (-12.0, -25.0)
 _DISTANCES = (1.1, 1.3, 1.5, 1.7)  # metres
+_NEAR = (0.8, 0.9, 1.0, 1.1)  # to a stove, whose knobs are small
 _WIDTH, _DEPTH, _HEIGHT = 0.3, 0.2, 0.22  # half the size of a toy, in metres
 _THIN = 0.012  # half the thickness of a board, in metres
 _GLOW, _RED = "1 .25 .05", ".7 .05 .05"
@@ -69,7 +69,8 @@ def _render(task: Task, style: _Style, done: bool) -> tuple[Frame, ...]:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_camlight(model, data)
-    cameras = [Camera((0, 0, 0), distance, _FRONT, up) for distance in _DISTANCES for up in _ELEVATIONS]
+    distances = _NEAR if _BUILDERS[task.name] is _stove else _DISTANCES
+    cameras = [Camera((0, 0, 0), distance, _FRONT, up) for distance in distances for up in task.elevations]
     canvas = Canvas(model, tuple(camera.to_mujoco() for camera in cameras), _SIZE)
     try:
         return tuple(np.ascontiguousarray(frame) for frame in canvas.draw(data))
@@ -148,15 +149,16 @@ def _sliding_cupboard(style: _Style, shift: float) -> str:
 
 def _stove(style: _Style, angle: float) -> str:
     """A knob on the panel behind the plates is turned, and the first plate glows."""
-    toy = _box((0, 0, -0.13), (_WIDTH, 0.28, 0.02), ".12 .12 .13") + _box((0, 0, -0.3), (_WIDTH, 0.27, 0.15), style.body)
-    toy += _box((0, 0.3, 0.06), (_WIDTH, 0.02, 0.17), style.door)
+    toy = _box((0, 0, -0.3), (_WIDTH, 0.27, 0.15), style.body) + _box((0, 0.3, 0.06), (_WIDTH, 0.02, 0.17), style.door)
+    toy += _box((0, 0, -0.13), (_WIDTH, 0.28, 0.02), ".12 .12 .13")
     for i, (x, y) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
         turned = angle if i == 0 else 0.0
         toy += _disc((x * 0.15, y * 0.13, -0.108), 0.09, 0.006, _GLOW if turned else ".3 .3 .32")
         at = (x * 0.08, 0.26, 0.08 + y * 0.08)
         toy += _disc(at, 0.07, 0.02, ".5 .5 .5", 'euler="90 0 0"')
-        mark = _box((0, -0.025, 0), (0.01, 0.02, 0.07), style.handle) + _box((0, -0.025, 0.06), (0.016, 0.022, 0.016), _RED)
-        toy += f'<body pos="{_numbers(at)}" euler="0 {math.degrees(-turned)} 0">{mark}</body>'
+        grip = _box((0, -0.025, 0), (0.01, 0.02, 0.07), style.handle)
+        mark = _box((0, -0.025, 0.06), (0.016, 0.022, 0.016), _RED)
+        toy += f'<body pos="{_numbers(at)}" euler="0 {math.degrees(-turned)} 0">{grip}{mark}</body>'
     return toy
 
 

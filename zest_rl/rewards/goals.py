@@ -4,7 +4,7 @@ A spec is one string:
 
 - ``same-scene``: the scene itself, rendered before and after; each camera view gets its own pair;
 - ``toys``: toy scenes of the task, made of simple shapes, before and after (`zest_rl.kitchen.toys`);
-- ``drawings``: the small drawings that come with the package;
+- ``drawings``: three small drawings of a microwave, an example of a goal that is found out to be wrong;
 - a folder with ``init/`` and ``goal/``, each holding one or more pictures;
 - ``visual-tasks:real_imgs`` or ``visual-tasks:drawings``: the task's folder in the paper's Visual Tasks Dataset, at the
   path in the environment variable ZEST_VISUAL_TASKS;
