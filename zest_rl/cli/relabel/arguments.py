@@ -24,8 +24,7 @@ class Config:
     """Cameras of the environment's model, to render recorded states from, averaged as views. Default: its own."""
     goal: str = "same-scene"
     """Folder with init/ and goal/ pictures, or "text:closed microwave -> open microwave"; and for the kitchen
-    "same-scene", "toys" (toy scenes of the task), "text" (the task's own sentences), or "drawings" (a wrong goal, as an
-    example)."""
+    "same-scene", "toys" (toy scenes of the task), "text" (the task's own sentences), or "drawings" (a wrong goal)."""
     embedder: str = "efficientnet-lite0"
     """Frozen network: efficientnet-lite0, open_clip:MODEL/PRETRAINED, torchvision:resnet50, timm:NAME, …@/path,
     transformers:/folder, or a family that another package registers."""
