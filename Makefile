@@ -15,7 +15,7 @@ setup: .venv/.complete ## make .venv with the tested versions, and install the G
 	touch $@
 
 demo: setup ## reproduce one task end to end and write its report; offline after the set-up
-	$(ZEST) reproduce eval/demo.toml
+	$(ZEST) reproduce demo
 
 test: lint ## lint and all quick tests
 	-.ci/setup.sh browser

@@ -21,6 +21,7 @@ from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return
 from zest_rl.report.content import Curve, MethodRow, TaskTable
 from zest_rl.report.episodes import paired_episodes, representative_episodes
 from zest_rl.report.goals import goal_panel, goal_scatter
+from zest_rl.report.headline import headline
 from zest_rl.report.methods import Method, goal_name, latest_evaluation, methods_of_runs, read_meta
 from zest_rl.report.sections import (
     CAVEATS,
@@ -229,7 +230,7 @@ def compare(
     curves = (draw(method) for draw in (return_curve, learning_curve) for method in methods)
     return Report(
         title,
-        _best_sentence(rows),
+        headline(rows, {method.name: metas[str(method.runs[0])] for method in methods}),
         (
             RESULTS(rows),
             CAVEATS([*caveats, *_unequal_starts(evaluations)]),
@@ -268,11 +269,12 @@ def overview(
     by_name = zip(*methods.values(), strict=True)
     rows = [method_row(group[0], *(method.evaluations() for method in group)) for group in by_name]
     rows.insert(0, dataset_row(*sources, paper=paper_demo))
+    metas = {method.name: read_meta(method.runs[0]) for method in next(iter(methods.values()))}
     scatters = [(task, scatter) for task, report in reports.items() for scatter in report.items(RANKING)]
     curves = [(task, curve) for task, report in reports.items() for curve in report.items(LEARNING_CURVES)]
     return Report(
         title,
-        _best_sentence(rows, f" over {len(reports)} datasets"),
+        headline(rows, metas, len(reports)),
         (
             RESULTS(rows),
             TASK_TABLES(TaskTable(task, report.items(RESULTS), pages[task]) for task, report in reports.items()),
@@ -281,16 +283,6 @@ def overview(
             LEARNING_CURVES(replace(curve, quantity=f"{task}: {curve.quantity}") for task, curve in curves),
             DETAILS((details or {}).items()),
         ),
-    )
-
-
-def _best_sentence(rows: Sequence[MethodRow], where: str = "") -> str:
-    best = max((row for row in rows if row.kind == "method"), key=lambda row: row.mean, default=None)
-    if best is None:
-        return ""
-    return (
-        f"{best.method} reaches {best.mean:.1f} % of the expert's return{where} (95 % interval {best.ci_low:.1f} to "
-        f"{best.ci_high:.1f}, {best.n_seeds} seed{'s' if best.n_seeds > 1 else ''}, {best.n_episodes} episodes)."
     )
 
 

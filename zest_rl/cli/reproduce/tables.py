@@ -7,7 +7,7 @@ from typing import Any
 
 
 def as_text(result: Mapping[str, Any]) -> str:
-    """Write the table, the figures of each task, and how well scores rank its episodes."""
+    """Write the table, the figures of each task, how well scores rank its episodes, and what is to be seen."""
     lines = [
         f"{'':<28}{'% of expert':>12}  {'95 % interval':<18}{'success':>8}{'seeds':>7}{'episodes':>10}{'paper':>8}"
     ]
@@ -27,7 +27,12 @@ def as_text(result: Mapping[str, Any]) -> str:
             value = "undefined" if rho is None else f"{rho['value']:.3f}"
             lines.append(f"{task}, goal {name}: Spearman ρ of ZeST and true returns {value}")
     return "\n".join(
-        [*lines, f"report: {result['report']}", f"{result['n_cells_run']} cells run, {result['seconds']} s"]
+        [
+            *lines,
+            result["summary"],
+            f"report: {result['report']}",
+            f"{result['n_cells_run']} cells run, {result['seconds']} s",
+        ]
     )
 
 

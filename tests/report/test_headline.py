@@ -1,0 +1,85 @@
+"""The sentence that a comparison opens with says what its rows say, whichever way they fall."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+
+from zest_rl.report.content import Kind, MethodRow
+from zest_rl.report.headline import headline
+
+
+def row(method: str, mean: float, half: float = 2.0, kind: Kind = "method", n_episodes: int = 20) -> MethodRow:
+    return MethodRow(method, mean, mean - half, mean + half, mean, 1.0, 1, n_episodes, kind)
+
+
+def meta(agent: str, goal: str | None = "same-scene", **relabel: Any) -> dict[str, Any]:
+    """The parts of a run's meta.json that say what it learned from."""
+    scorer = {"config": {"goal": goal, "embedder": "e", "features": "delta", "similarity": "cos", "views": None}}
+    hashes = {"goal_sha256": "", "embedder_sha256": ""}
+    frames = {"views": ["camera"]}
+    record = {"source": "a/b-v0", "source_sha256": "", "reward": "level", "scorer": {**scorer, **hashes}}
+    zest = {} if goal is None else {"relabel": {**record, "frames": frames, **relabel}}
+    return {"agent": agent, "dataset": {"id": "a/b-v0", "zest": zest}}
+
+
+DATA = row("Demo", 82.6, kind="dataset", n_episodes=60)
+METAS = {
+    "BC": meta("bc"),
+    "ZeST+RvS": meta("rvs"),
+    "ZeST+DT": meta("dt"),
+    "by a sentence": meta("dt", "text:closed -> open"),
+    "GT": meta("dt", None),
+    "shuffled": meta("dt", shuffle=0),
+}
+SAME = "Trained on the same 60 episodes, which themselves reach 83 % of the expert, behaviour cloning reaches "
+
+
+@pytest.mark.parametrize(
+    ("rows", "sentence"),
+    [
+        (
+            [row("BC", 83.1), row("ZeST+RvS", 97.4), row("ZeST+DT", 96.0)],
+            "83 % and ZeST+RvS, which learned from a picture's rewards, 97 % (95 % intervals 81 to 85 and 95 to 99).",
+        ),
+        (
+            [row("BC", 93.0), row("by a sentence", 95.0)],
+            "93 % and by a sentence, which learned from a sentence's rewards, 95 % "
+            "(95 % intervals 91 to 95 and 93 to 97); as these overlap, the difference may be chance.",
+        ),
+        (
+            [row("BC", 99.0), row("ZeST+DT", 96.9), row("ZeST+RvS", 90.0)],
+            "99 %, and no method that learned from a picture's rewards is above it: ZeST+DT reaches 97 % "
+            "(95 % intervals 97 to 101 and 95 to 99).",
+        ),
+        (
+            [row("BC", 83.0), row("ZeST+DT", 90.0), row("GT", 99.0), row("shuffled", 98.0)],
+            "83 % and ZeST+DT, which learned from a picture's rewards, 90 % (95 % intervals 81 to 85 and 88 to 92).",
+        ),
+        (
+            [row("BC", 83.0), row("ZeST+DT", 90.0), row("ZeST+RvS", 99.0, kind="control")],
+            "83 % and ZeST+DT, which learned from a picture's rewards, 90 % (95 % intervals 81 to 85 and 88 to 92).",
+        ),
+    ],
+    ids=["above", "within the intervals", "not above", "other rewards do not count", "controls do not count"],
+)
+def test_the_best_of_zest_rewards_is_compared_with_cloning(rows: Sequence[MethodRow], sentence: str) -> None:
+    assert headline([DATA, *rows], METAS) == SAME + sentence
+
+
+def test_several_datasets_are_told() -> None:
+    told = headline([DATA, row("BC", 83.0), row("ZeST+DT", 90.0)], METAS, n_datasets=6)
+    assert told.startswith("Trained on the same 60 episodes of 6 datasets, which")
+
+
+@pytest.mark.parametrize(
+    "without", [lambda row: row.kind == "dataset", lambda row: row.method == "BC"], ids=["no dataset", "no cloning"]
+)
+def test_without_the_dataset_or_cloning_the_best_method_is_told(without: Callable[[MethodRow], bool]) -> None:
+    rows = [each for each in (DATA, row("BC", 83.0), row("GT", 92.0), row("ZeST+DT", 90.0)) if not without(each)]
+    assert headline(rows, METAS) == (
+        "GT reaches 92.0 % of the expert's return (95 % interval 90.0 to 94.0, 1 seed, 20 episodes)."
+    )
+    assert headline([], {}) == ""
