@@ -96,7 +96,7 @@ def test_acting_sees_what_training_sees(tmp_path: Path, timesteps: dt.Timesteps)
         timestep = torch.arange(n) + (first if timesteps == "absolute" else 0)
         batch = {
             "obs": torch.from_numpy(facts.normalize(obs[:, window].astype(np.float32))),
-            "seen_actions": torch.from_numpy(actions[:, window]),
+            "actions": torch.from_numpy(actions[:, window]),
             "rtg": (8.0 - torch.arange(first, step + 1.0))[None, :, None].expand(2, n, 1) / facts.return_scale,
             "timesteps": timestep.expand(2, n),
             "valid": torch.ones(2, n, dtype=torch.bool),
@@ -126,7 +126,7 @@ def test_what_stands_in_the_padding_changes_neither_the_loss_nor_its_gradient() 
     padding = ~batch["valid"]
     assert padding.any()
     other = dict(batch)
-    for name, rubbish in (("obs", 1e3), ("actions", -10.0), ("seen_actions", -10.0), ("rtg", 77.0), ("timesteps", 0)):
+    for name, rubbish in (("obs", 1e3), ("actions", -10.0), ("rtg", 77.0), ("timesteps", 0)):
         other[name] = batch[name].clone()
         other[name][padding] = rubbish
     torch.manual_seed(0)

@@ -65,8 +65,6 @@ class DTConfig(OptimizerConfig):
     """False zeroes the return-to-go: the same network without any information from the scores."""
     context_len: int = 20
     """K, the steps that the network sees."""
-    sees_actions: bool = True
-    """False zeroes the past actions that the network sees, which it can otherwise copy."""
     timesteps: Timesteps = "absolute"
     """What a step's embedding counts from: the start of the episode, as in the paper, or the start of the window."""
     hidden_size: int = 128
@@ -154,7 +152,7 @@ def predict_actions(model: nn.Module, batch: Batch) -> Tensor:
     """Return the actions [batch, K, act_dim] float32 that the model would take at each step of its windows."""
     output = model(
         states=batch["obs"],
-        actions=batch["seen_actions"],
+        actions=batch["actions"],
         returns_to_go=batch["rtg"],
         timesteps=batch["timesteps"],
         attention_mask=batch["valid"].long(),
@@ -193,7 +191,6 @@ def make_sampler(config: DTConfig, facts: DataFacts, episodes: Sequence[Episode]
         return {
             "obs": obs[index],  # [batch, K, obs_dim]
             "actions": actions[index],  # [batch, K, act_dim]
-            "seen_actions": actions[index] if config.sees_actions else torch.zeros_like(actions[index]),
             "rtg": rtg[index][..., None],  # [batch, K, 1]
             "timesteps": torch.from_numpy(timesteps),  # [batch, K]
             "valid": torch.from_numpy(steps >= first),  # [batch, K], False is padding
@@ -258,7 +255,7 @@ class DTPolicy:
         n = len(obs)
         step = {
             "obs": self._facts.normalize(obs),
-            "seen_actions": np.zeros((n, self._facts.act_dim), np.float32),  # not known yet; later steps attend to it
+            "actions": np.zeros((n, self._facts.act_dim), np.float32),  # not known yet; only later steps attend to it
             "rtg": self._asked.scaled()[:, None],
         }
         self._window.append(step)
@@ -270,8 +267,7 @@ class DTPolicy:
         batch = {name: torch.tensor(array, device=self._device) for name, array in arrays.items()}
         with self._autocast:
             actions = mean_over_networks(predict_actions, self._model, batch)[:, -1].cpu().numpy()
-        if self._config.sees_actions:
-            step["seen_actions"] = actions
+        step["actions"] = actions
         self._step += 1
         return actions.copy()
 
