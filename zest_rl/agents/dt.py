@@ -8,6 +8,7 @@ gradient clip 0.25, weight decay 1e-4). Deviations:
   - learning rate 3e-4 with 200 updates of warm-up instead of 1e-4 with 10,000, as we train for thousands of updates,
     not for a hundred thousand; what acts is a moving average of the weights, which single updates do not shake;
   - observations are normalised with a floor under the deviation and a bound on the result (`base.STD_FLOOR`);
+  - the recipes use K = 1: with a longer context it loses grasps (``docs/findings.md``, 2026-11-26);
   - ``timesteps="relative"`` counts time from the start of the window, so that late steps use trained embeddings;
   - padding repeats a valid step instead of a constant; as in theirs, attention and loss leave it out;
   - transformers initialises every embedding with a standard deviation of 0.02, theirs has torch's default;
