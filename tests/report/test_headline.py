@@ -42,25 +42,28 @@ SAME = "Trained on the same 60 episodes, which themselves reach 83 % of the expe
     [
         (
             [row("BC", 83.1), row("ZeST+RvS", 97.4), row("ZeST+DT", 96.0)],
-            "83 % and ZeST+RvS, which learned from a picture's rewards, 97 % (95 % intervals 81 to 85 and 95 to 99).",
+            "83 % and ZeST+RvS, which learned from a picture's rewards, 97 % "
+            "(95 % intervals 81.1 to 85.1 and 95.4 to 99.4).",
         ),
         (
             [row("BC", 93.0), row("by a sentence", 95.0)],
             "93 % and by a sentence, which learned from a sentence's rewards, 95 % "
-            "(95 % intervals 91 to 95 and 93 to 97); as these overlap, the difference may be chance.",
+            "(95 % intervals 91.0 to 95.0 and 93.0 to 97.0); as these overlap, the difference may be chance.",
         ),
         (
             [row("BC", 99.0), row("ZeST+DT", 96.9), row("ZeST+RvS", 90.0)],
             "99 %, and no method that learned from a picture's rewards is above it: ZeST+DT reaches 97 % "
-            "(95 % intervals 97 to 101 and 95 to 99).",
+            "(95 % intervals 97.0 to 101.0 and 94.9 to 98.9).",
         ),
         (
             [row("BC", 83.0), row("ZeST+DT", 90.0), row("GT", 99.0), row("shuffled", 98.0)],
-            "83 % and ZeST+DT, which learned from a picture's rewards, 90 % (95 % intervals 81 to 85 and 88 to 92).",
+            "83 % and ZeST+DT, which learned from a picture's rewards, 90 % "
+            "(95 % intervals 81.0 to 85.0 and 88.0 to 92.0).",
         ),
         (
             [row("BC", 83.0), row("ZeST+DT", 90.0), row("ZeST+RvS", 99.0, kind="control")],
-            "83 % and ZeST+DT, which learned from a picture's rewards, 90 % (95 % intervals 81 to 85 and 88 to 92).",
+            "83 % and ZeST+DT, which learned from a picture's rewards, 90 % "
+            "(95 % intervals 81.0 to 85.0 and 88.0 to 92.0).",
         ),
     ],
     ids=["above", "within the intervals", "not above", "other rewards do not count", "controls do not count"],

@@ -45,7 +45,7 @@ def _mean(row: MethodRow) -> float:
 
 
 def _interval(row: MethodRow) -> str:
-    return f"{row.ci_low:.0f} to {row.ci_high:.0f}"
+    return f"{row.ci_low:.1f} to {row.ci_high:.1f}"
 
 
 def _giver(meta: Mapping[str, Any]) -> str:
