@@ -189,6 +189,8 @@ def test_a_damaged_checkpoint_of_a_training_is_read_or_refused_even_under_its_ow
         ("dt-0", {"context_len": 10**9}),
         ("dt-0", {"n_layers": 500, "hidden_size": 2**14}),
         ("bc-0", {"hidden_size": 16000}),
+        ("bc-0", {"n_networks": 10**9}),
+        ("bc-0", {"n_networks": 100, "hidden_size": 2**12}),
     ],
 )
 def test_a_run_that_asks_for_absurd_room_is_refused_before_it_is_made(

@@ -11,8 +11,8 @@ import pytest
 import safetensors.torch
 import torch
 
-from zest_rl.agents import AGENTS, bc, dt, load_policy, rvs
-from zest_rl.agents.base import Policy, describe_data, mean_over_networks, returns_to_go
+from zest_rl.agents import bc, dt, load_policy, rvs
+from zest_rl.agents.base import Policy, describe_data, returns_to_go
 from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
 from zest_rl.training.loop import TrainingConfig, fit
@@ -126,11 +126,23 @@ def test_several_networks_start_apart_and_their_mean_acts(agent: str, tmp_path: 
 
 
 @pytest.mark.parametrize("agent", CONFIGS)
-def test_the_loss_of_several_networks_is_their_mean(agent: str) -> None:
-    config, episodes = replace(CONFIGS[agent], n_networks=2, dropout=0.0), two_behaviours()
-    facts, definition = describe_data(episodes), AGENTS[agent]
-    model = definition.networks(config, facts)
-    assert isinstance(model, torch.nn.ModuleList)
-    batch = definition.sampler(config, facts, episodes)(np.random.default_rng(0))
-    apart = [definition.loss(network, batch).item() for network in model]
-    assert mean_over_networks(definition.loss, model, batch).item() == pytest.approx(sum(apart) / 2, rel=1e-5)
+def test_the_first_of_several_networks_is_the_one_that_is_trained_alone(agent: str, tmp_path: Path) -> None:
+    config = replace(CONFIGS[agent], dropout=0.0, grad_clip=0.01)  # so small that it always clips
+
+    def weights(name: str, n_networks: int) -> dict[str, torch.Tensor]:
+        how = TrainingConfig(n_updates=5, threads=1)
+        run = fit(agent, replace(config, n_networks=n_networks), two_behaviours(), tmp_path / name, how)
+        return safetensors.torch.load_file(run / "model.safetensors")
+
+    alone, together = weights("alone", 1), weights("together", 3)
+    for name, tensor in alone.items():
+        assert torch.equal(together[f"0.{name}"], tensor), name
+
+
+@pytest.mark.parametrize("target", [np.inf, np.nan, None])
+def test_a_policy_that_uses_no_returns_acts_the_same_whatever_is_asked_for_or_earned(
+    target: float | None, tmp_path: Path
+) -> None:
+    config = replace(SMALL, condition_on_return=False)
+    policy = load_policy(fit("rvs", config, two_behaviours(), tmp_path / "run", TrainingConfig(n_updates=3, threads=1)))
+    np.testing.assert_array_equal(play(policy, target, reward=np.inf), play(policy, 8.0))

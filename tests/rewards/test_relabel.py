@@ -384,7 +384,7 @@ def test_nothing_flows_from_the_ground_truth_into_rewards_or_policies(
         prepare(SOURCE)
         truth = [gt.rewards for gt in read(SOURCE, Dataset.truth)]
         made = relabel_kitchen(CONFIG, n_workers=1).dataset_id
-        for agent in ("bc", "dt"):
+        for agent in ("bc", "dt", "rvs"):
             small = ["--n-updates", "10", "--hidden-size", "16", "--n-layers", "1", "--batch-size", "8"]
             run = ["--run-dir", str(tmp_path / f"{name} {agent}"), "--threads", "1", "--device", "cpu"]
             assert main(["train", agent, made, *small, *run]) == 0
@@ -404,7 +404,7 @@ def test_nothing_flows_from_the_ground_truth_into_rewards_or_policies(
     for i in range(4):
         np.testing.assert_array_equal(real["scores"][i], noise["scores"][i])
         np.testing.assert_array_equal(real["episodes"][i].rewards, noise["episodes"][i].rewards)
-    for agent in ("bc", "dt"):
+    for agent in ("bc", "dt", "rvs"):
         weights = [(tmp_path / f"{name} {agent}" / "model.safetensors").read_bytes() for name in ("real", "noise")]
         assert weights[0] == weights[1]
         metas = [json.loads((tmp_path / f"{name} {agent}" / "meta.json").read_text()) for name in ("real", "noise")]

@@ -34,9 +34,23 @@ def weights(run_dir: Path) -> dict[str, np.ndarray]:
     return load_file(run_dir / "model.safetensors")
 
 
-@pytest.mark.parametrize("agent", ["bc", "dt"])
-def test_two_processes_train_what_one_does(agent: str, collected: str, tmp_path: Path) -> None:
-    words = [agent, collected, "--n-updates", 20, "--warmup-updates", 0, "--batch-size", 33, "--dropout", 0, "--json"]
+@pytest.mark.parametrize(("agent", "n_networks"), [("bc", 1), ("dt", 1), ("rvs", 2)])
+def test_two_processes_train_what_one_does(agent: str, n_networks: int, collected: str, tmp_path: Path) -> None:
+    words = [
+        agent,
+        collected,
+        "--n-networks",
+        n_networks,
+        "--n-updates",
+        20,
+        "--warmup-updates",
+        0,
+        "--batch-size",
+        33,
+        "--dropout",
+        0,
+        "--json",
+    ]
     two = run(2, *words, "--run-dir", tmp_path / "two")
     assert two.returncode == 0, two.stderr
     assert json.loads(two.stdout)["n_updates"] == 20, "one document, from the first process"

@@ -22,6 +22,7 @@ from zest_rl.agents import AGENTS, load_policy
 from zest_rl.agents.base import describe_data
 from zest_rl.agents.bc import BCConfig
 from zest_rl.agents.dt import DTConfig
+from zest_rl.agents.rvs import RvSConfig
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.training import loop
 from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint, snapshot_folder
@@ -31,6 +32,7 @@ from zest_rl.types import Episode
 CONFIGS: dict[str, Any] = {
     "bc": BCConfig(hidden_size=16, n_layers=2, batch_size=16, warmup_updates=5, learning_rate=1e-3),
     "dt": DTConfig(context_len=4, hidden_size=16, n_layers=1, batch_size=8, warmup_updates=5, learning_rate=1e-3),
+    "rvs": RvSConfig(hidden_size=16, n_layers=2, batch_size=16, warmup_updates=5, dropout=0.1, n_networks=2),
 }
 
 
@@ -314,3 +316,13 @@ def test_a_manifest_of_other_files_than_those_of_a_checkpoint_is_refused(manifes
     (folder / "manifest.json").write_text(json.dumps(manifest))
     with pytest.raises(ZestError, match=r"damaged: manifest\.json is not what was written"):
         resume(tmp_path, state)
+
+
+def test_a_run_from_before_an_option_existed_goes_on_and_a_finished_one_is_found_finished(tmp_path: Path) -> None:
+    run = start(tmp_path / "run", "bc")
+    request = json.loads((run / "run.json").read_text())
+    del request["config"]["n_networks"]
+    (run / "run.json").write_text(json.dumps(request))
+    before = (run / "model.safetensors").read_bytes()
+    assert start(run, "bc") == run
+    assert (run / "model.safetensors").read_bytes() == before

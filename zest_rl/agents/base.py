@@ -23,7 +23,6 @@ Sampler = Callable[[np.random.Generator], Batch]
 # once it moves. Hence a floor (rad or m, as the kitchen's observations) and a bound (in standard deviations).
 STD_FLOOR = 1e-3
 MAX_NORMALIZED = 10.0
-MAX_NETWORKS = 100
 
 
 @dataclass(frozen=True)
@@ -131,7 +130,7 @@ Rule = tuple[bool, str]  # (holds, "must be …")
 Rules = Mapping[str, Rule]  # by field
 
 LARGEST_WIDTH, MOST_LAYERS, MOST_WEIGHTS = 2**14, 1000, 10**9
-LARGEST_BATCH = 2**20
+LARGEST_BATCH, MOST_NETWORKS = 2**20, 100
 """Room is made only below these bounds."""
 
 
@@ -140,17 +139,17 @@ def whole(value: int, largest: int) -> Rule:
     return 1 <= value <= largest, f"1 to {largest}"
 
 
-def few_weights(n_layers: int, weights_per_layer: int) -> Rule:
-    """Return the rule of a number of equal layers."""
+def few_weights(n_layers: int, weights_per_layer: int, n_networks: int) -> Rule:
+    """Return the rule of a number of equal layers in each of several networks."""
     return (
-        1 <= n_layers <= MOST_LAYERS and n_layers * weights_per_layer <= MOST_WEIGHTS,
+        1 <= n_layers <= MOST_LAYERS and n_networks * n_layers * weights_per_layer <= MOST_WEIGHTS,
         f"1 to {MOST_LAYERS}, and few enough for {MOST_WEIGHTS:,} weights in all",
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class OptimizerConfig:
-    """What the config of every agent inherits: the fields that `zest_rl.training.loop` reads."""
+    """What the config of every agent inherits: how its networks are trained, and how many of them."""
 
     learning_rate: float = 3e-4
     """AdamW's step size after warm-up."""
@@ -166,7 +165,7 @@ class OptimizerConfig:
     amp: Precision = "auto"
     """Precision of matrix products; auto is bf16 where the hardware has it."""
     n_networks: int = 1
-    """Networks that are trained side by side from different initial weights; the mean of their actions acts."""
+    """Networks that are trained on the same batches from different initial weights; the mean of their actions acts."""
 
     def optimizer_rules(self) -> Rules:
         """Return the rules of these fields."""
@@ -177,7 +176,7 @@ class OptimizerConfig:
             "grad_clip": (0 < self.grad_clip < float("inf"), "positive"),
             "ema_decay": (0 <= self.ema_decay < 1, "in [0, 1)"),
             "amp": (self.amp in get_args(Precision), f"one of {', '.join(get_args(Precision))}"),
-            "n_networks": whole(self.n_networks, MAX_NETWORKS),
+            "n_networks": whole(self.n_networks, MOST_NETWORKS),
         }
 
 
@@ -198,10 +197,10 @@ def check_returns(facts: DataFacts) -> None:
 
 
 class ReturnToGo:
-    """The returns that N episodes still ask for, in the data's units; zeros for a policy that uses none."""
+    """The returns that N episodes still ask for, in the data's units; always zero for a policy that uses none."""
 
     def __init__(self, facts: DataFacts, is_used: bool):
-        self._scale = facts.return_scale if is_used else np.inf
+        self._scale = facts.return_scale
         self._is_used = is_used
         self._remaining = np.zeros(0)
 
@@ -219,15 +218,18 @@ class ReturnToGo:
                 f"a policy conditioned on returns must be asked for a finite return, got {target_return}; "
                 "take a quantile of the training returns from meta['return_quantiles']"
             )
-        self._remaining = np.full(n_episodes, target_return or 0.0)
+        self._remaining = np.full(n_episodes, target_return if self._is_used else 0.0)
 
     def scaled(self) -> FloatArray:
         """Return (N,) float32, divided by the largest absolute return of the data."""
+        if not self._is_used:
+            return self._remaining.astype(np.float32)
         return (self._remaining / self._scale).astype(np.float32)
 
     def subtract(self, rewards: FloatArray) -> None:
         """Subtract what the last actions earned, (N,)."""
-        self._remaining = self._remaining - rewards
+        if self._is_used:
+            self._remaining = self._remaining - rewards
 
 
 def mlp(n_inputs: int, hidden_size: int, n_layers: int, n_outputs: int, dropout: float) -> nn.Sequential:
@@ -238,11 +240,14 @@ def mlp(n_inputs: int, hidden_size: int, n_layers: int, n_outputs: int, dropout:
     return nn.Sequential(*layers, nn.Linear(hidden_size, n_outputs), nn.Tanh())
 
 
-def mean_over_networks(compute: Callable[[nn.Module, T], Tensor], model: nn.Module, batch: T) -> Tensor:
-    """Return the mean of ``compute(network, batch)``, a loss or actions, over the networks of `Agent.networks`."""
-    if not isinstance(model, nn.ModuleList):
-        return compute(model, batch)
-    return torch.stack([compute(network, batch) for network in model]).mean(dim=0)
+def networks_of(model: nn.Module) -> list[nn.Module]:
+    """Return the networks of what `Agent.networks` returned."""
+    return list(model) if isinstance(model, nn.ModuleList) else [model]
+
+
+def mean_action(predict: Callable[[nn.Module, T], Tensor], model: nn.Module, batch: T) -> Tensor:
+    """Return the mean of ``predict(network, batch)``, actions of any shape, over the networks of `Agent.networks`."""
+    return torch.stack([predict(network, batch) for network in networks_of(model)]).mean(dim=0)
 
 
 class Policy(Protocol):

@@ -37,7 +37,7 @@ from zest_rl.agents.base import (
     check_fields,
     check_obs,
     few_weights,
-    mean_over_networks,
+    mean_action,
     mlp,
     whole,
 )
@@ -65,7 +65,7 @@ class BCConfig(OptimizerConfig):
         check_fields("BC config", self, {
             "top_fraction": (0 < self.top_fraction <= 1, "in (0, 1]"),
             "hidden_size": whole(self.hidden_size, LARGEST_WIDTH),
-            "n_layers": few_weights(self.n_layers, self.hidden_size**2),
+            "n_layers": few_weights(self.n_layers, self.hidden_size**2, self.n_networks),
             "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
             "batch_size": whole(self.batch_size, LARGEST_BATCH),
             **self.optimizer_rules(),
@@ -141,7 +141,7 @@ class BCPolicy:
         check_obs(obs, self._n_episodes, self._facts.obs_dim)
         normalized = torch.from_numpy(self._facts.normalize(obs)).to(self._device)
         with self._autocast:
-            actions = mean_over_networks(predict_actions, self._model, normalized)
+            actions = mean_action(predict_actions, self._model, normalized)
         return actions.cpu().numpy()
 
     def observe(self, rewards: FloatArray) -> None:

@@ -8,7 +8,7 @@ gradient clip 0.25, weight decay 1e-4). Deviations:
   - learning rate 3e-4 with 200 updates of warm-up instead of 1e-4 with 10,000, as we train for thousands of updates,
     not for a hundred thousand; what acts is a moving average of the weights, which single updates do not shake;
   - observations are normalised with a floor under the deviation and a bound on the result (`base.STD_FLOOR`);
-  - the recipes use K = 1: with a longer context it loses grasps (``docs/findings.md``, 2026-11-26);
+  - ``train/dt.toml`` and the table use K = 1, which acted best on development data (``docs/findings.md``, 2026-11-26);
   - ``timesteps="relative"`` counts time from the start of the window, so that late steps use trained embeddings;
   - padding repeats a valid step instead of a constant; as in theirs, attention and loss leave it out;
   - transformers initialises every embedding with a standard deviation of 0.02, theirs has torch's default;
@@ -43,7 +43,7 @@ from zest_rl.agents.base import (
     check_obs,
     check_returns,
     few_weights,
-    mean_over_networks,
+    mean_action,
     returns_to_go,
     whole,
 )
@@ -83,7 +83,7 @@ class DTConfig(OptimizerConfig):
         check_fields("DT config", self, {
             "context_len": whole(self.context_len, LONGEST_CONTEXT),
             "hidden_size": whole(self.hidden_size, LARGEST_WIDTH),
-            "n_layers": few_weights(self.n_layers, 12 * self.hidden_size**2),
+            "n_layers": few_weights(self.n_layers, 12 * self.hidden_size**2, self.n_networks),
             "n_heads": (
                 self.n_heads >= 1 and self.hidden_size % self.n_heads == 0,
                 f"a divisor of hidden_size ({self.hidden_size})",
@@ -267,7 +267,7 @@ class DTPolicy:
         arrays["valid"] = np.ones((n, length), dtype=bool)
         batch = {name: torch.tensor(array, device=self._device) for name, array in arrays.items()}
         with self._autocast:
-            actions = mean_over_networks(predict_actions, self._model, batch)[:, -1].cpu().numpy()
+            actions = mean_action(predict_actions, self._model, batch)[:, -1].cpu().numpy()
         step["actions"] = actions
         self._step += 1
         return actions.copy()

@@ -1,12 +1,13 @@
 """Return-conditioned MLP: an MLP from observation and return-to-go to the action, mean squared error.
 
-RvS-R of Emmons et al. 2022 (https://arxiv.org/abs/2112.10751; Table 1 of its appendix: width 1024, 2 hidden layers,
-batch 16,384, learning rate 1e-3, ReLU, dropout 0.1). It is `bc` with the return-to-go as one more input, and asks for
-returns as `dt` does. Deviations from the paper:
-  - the return-to-go itself as in the Decision Transformer, not divided by the steps that are left;
-  - the network of `bc`, three hidden layers of 512 units, and no dropout;
-  - 320 transitions per update;
-  - tanh at the end and a squared error instead of a Gaussian's likelihood; averaged weights act.
+RvS-R of Emmons et al. 2022 (https://arxiv.org/abs/2112.10751: width 1024, 2 hidden layers, batch 16,384, Adam, learning
+rate 1e-3, ReLU). It is the network of `bc` with the return-to-go as one more input, and asks for returns as `dt` does.
+Deviations:
+  - the return-to-go itself, divided by the largest absolute return of the data as in `dt`, not by the steps left;
+  - three hidden layers of 512 units, as in `bc`, and 320 transitions per update;
+  - AdamW with warm-up and clipped gradients; what acts is a moving average of the weights, as in `bc` and `dt`;
+  - observations are normalised with a floor under the deviation and a bound on the result (`base.STD_FLOOR`);
+  - tanh at the end and a squared error instead of a Gaussian's likelihood.
 ``condition_on_return=False`` is the null control: the return-to-go is zero at every step, in training and acting.
 """
 
@@ -36,7 +37,7 @@ from zest_rl.agents.base import (
     check_obs,
     check_returns,
     few_weights,
-    mean_over_networks,
+    mean_action,
     mlp,
     returns_to_go,
     whole,
@@ -66,7 +67,7 @@ class RvSConfig(OptimizerConfig):
     def __post_init__(self) -> None:
         check_fields("RvS config", self, {
             "hidden_size": whole(self.hidden_size, LARGEST_WIDTH),
-            "n_layers": few_weights(self.n_layers, self.hidden_size**2),
+            "n_layers": few_weights(self.n_layers, self.hidden_size**2, self.n_networks),
             "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
             "batch_size": whole(self.batch_size, LARGEST_BATCH),
             **self.optimizer_rules(),
@@ -154,7 +155,7 @@ class RvSPolicy:
         inputs = np.concatenate([self._facts.normalize(obs), self._asked.scaled()[:, None]], axis=1)
         batch = torch.from_numpy(inputs).to(self._device)
         with self._autocast:
-            actions = mean_over_networks(predict_actions, self._model, batch)
+            actions = mean_action(predict_actions, self._model, batch)
         return actions.cpu().numpy()
 
     def observe(self, rewards: FloatArray) -> None:

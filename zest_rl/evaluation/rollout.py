@@ -1,7 +1,7 @@
 """Policy + environment (+ scorer for the online return-to-go) → traces of N episodes, run in lockstep.
 
-The Decision Transformer's return-to-go falls by the *online ZeST score* of each new state, in the units of its training
-rewards. Ground-truth rewards are recorded; only a policy that was trained on them gets them.
+The return-to-go that a policy is conditioned on falls by the *online ZeST score* of each new state, in the units of its
+training rewards. Ground-truth rewards are recorded; only a policy that was trained on them gets them.
 """
 
 from __future__ import annotations

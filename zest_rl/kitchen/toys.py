@@ -2,7 +2,7 @@
 
 No robot, no kitchen, no picture file: a microwave, cupboards and a stove of boxes and cylinders. What makes them work,
 chosen on development data (docs/findings.md): they are seen from the front, near and far, from the heights that the
-task is seen from, and opened as far as it demands; cupboards stand empty in a row; a stove shows its knobs, too.
+task is seen from; hinged doors open as far as it demands; cupboards stand empty in a row; a stove shows its knobs, too.
 """
 
 from __future__ import annotations
@@ -166,4 +166,5 @@ _BUILDERS: dict[str, Callable[[_Style, float], str]] = {
     "knob2": _stove, "knob3": _stove, "ldoor": _cupboard(-1), "rdoor": _cupboard(1), "sdoor": _sliding_cupboard,
     "micro": _microwave,
 }  # fmt: skip
-"""By task: the toy's MJCF at a position of the task's joint, 0 before and `Task.goal` after it."""
+"""By task: the toy's MJCF at a position of the task's joint, 0 before and `Task.goal` after it (a sliding door is shut
+or open)."""

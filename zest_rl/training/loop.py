@@ -40,7 +40,7 @@ from zest_rl.agents.base import (
     autocast,
     check_fields,
     describe_data,
-    mean_over_networks,
+    networks_of,
     resolve_precision,
 )
 from zest_rl.errors import BadInput, ZestError
@@ -160,6 +160,7 @@ def fit(
         group.agree(updates_done=state.update)
         _reseed_others(config.seed, group, state.update)
         params = list(state.params.values())
+        networks = networks_of(state.model)
         n_reported, row_update = 0, state.update
         tick = row_tick = time.perf_counter()
         with MetricsLog(run_dir, state.update) if group.leads else nullcontext() as log:
@@ -169,20 +170,22 @@ def fit(
                 batch = {name: tensor.to(device) for name, tensor in rows.items()}
                 # loss
                 with autocast(precision, device):
-                    loss = mean_over_networks(definition.loss, state.model, batch) * weight
+                    loss = torch.stack([definition.loss(network, batch) for network in networks]).sum() * weight
                 # step
                 learning_rate = _learning_rate(agent_config, state.update)
                 for options in state.optimizer.param_groups:
                     options["lr"] = learning_rate
                 state.optimizer.zero_grad()
                 loss.backward()  # type: ignore[no-untyped-call]
-                loss = loss.detach()
+                loss = loss.detach() / len(networks)
                 group.average([loss, *(p.grad for p in params if p.grad is not None)])
-                norm = nn.utils.clip_grad_norm_(params, agent_config.grad_clip)
+                network_norms = [
+                    nn.utils.clip_grad_norm_(network.parameters(), agent_config.grad_clip) for network in networks
+                ]
                 state.optimizer.step()
                 state.update += 1
                 state.update_average(params, agent_config.ema_decay)
-                state.recent.append((loss.item(), norm.item()))
+                state.recent.append((loss.item(), torch.stack(network_norms).mean().item()))
                 if not all(map(math.isfinite, state.recent[-1])):
                     raise ZestError(
                         f"loss and gradient must be finite, got {state.recent[-1]} at update {state.update}; "
@@ -297,7 +300,8 @@ def _check_request(run_dir: Path, request: dict[str, Any]) -> None:
     """Write ``run.json``, or check that the existing one holds the same arguments."""
     path = run_dir / "run.json"
     if path.exists():
-        before, now = _flat(artifacts.read_json(path)), _flat(json.loads(json.dumps(request)))
+        defaults = _flat({"config": asdict(get_agent(request["agent"]).config())})  # of options newer than the run
+        before, now = defaults | _flat(artifacts.read_json(path)), _flat(json.loads(json.dumps(request)))
         differing = [
             f"{key} (was {before.get(key)!r}, is {now.get(key)!r})"
             for key in sorted(before.keys() | now.keys())
