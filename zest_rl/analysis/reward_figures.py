@@ -122,7 +122,7 @@ def reward_warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimat
         return ["All frames score the same: this goal and embedder tell nothing apart. Look at the goal's pictures."]
     sentences = []
     if np.ptp(reward_quality.returns_of(rewards)) == 0:
-        sentences.append("All episodes have the same return: there is nothing to condition a Decision Transformer on.")
+        sentences.append("All episodes have the same return: there is nothing to condition a policy on.")
     if "contradictory" in figures and figures["contradictory"].value >= CONTRADICTORY:
         sentences.append(
             f"{figures['contradictory'].value:.0%} of the frames score otherwise than an equal frame of the same "
