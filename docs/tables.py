@@ -1,6 +1,6 @@
 """Writes the tables of README.md, docs/results.md and eval/README.md from the committed results; run by `make tables`.
 
-What stands between two comments is written anew::
+What stands between two comments is written again::
 
     <!-- make tables: table1, rows BC | ZeST+DT -->     these rows of eval/results/table1.json, over all tasks alone
     <!-- make tables: table1 -->                        all rows, each task, how well scores rank the episodes, the time
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +36,11 @@ def _table(name: str, rows: str | None) -> str:
         return _recipes()
     result = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
     if rows:
-        return f"{as_markdown(result, rows.split(' | '))}\n{_source(result)}.\n"
-    return f"{as_markdown(result)}\n{_ranks(result)}\n{_source(result)}; wall time: {wall_time(result)}.\n"
+        shown = rows.split(" | ")
+        return f"{as_markdown(result, shown)}\n{_source(result, shown)}.\n"
+    return (
+        f"{as_markdown(result)}\n{_ranks(result)}\n{_source(result, result['rows'])}; wall time: {wall_time(result)}.\n"
+    )
 
 
 def _ranks(result: Mapping[str, Any]) -> str:
@@ -51,8 +54,8 @@ def _ranks(result: Mapping[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _source(result: Mapping[str, Any]) -> str:
-    trained = [row for row in result["rows"].values() if row["kind"] != "dataset"]
+def _source(result: Mapping[str, Any], shown: Iterable[str]) -> str:
+    trained = [row for row in map(result["rows"].get, shown) if row["kind"] != "dataset"]
     n_seeds = sorted({row["n_seeds"] for row in trained})
     per_task = trained[0]["n_episodes"] // trained[0]["n_seeds"] // len(result["tasks"])
     provenance = result["provenance"]

@@ -280,7 +280,7 @@ OLD = {"agents/dt.py": "0" * 64, "agents/gone.py": "0" * 64}
 
 
 def of_other_code(output: Path, agent: str) -> Path:
-    """Make a finished cell one of other code, of another revision."""
+    """Make a finished cell one of different code, of another revision."""
     run = cell(output, agent)
     (evaluated,) = (output / "code").glob(f"{run.name}-*.json")
     for path in (output / "code" / f"{run.name}.json", evaluated):
@@ -298,10 +298,10 @@ def test_results_of_one_code_name_it(whole: Reproduced) -> None:
     revisions = [now.git_revision] if now.git_revision else []
     by_now = {"source_sha256": now.sha256, "git_revisions": revisions, "n_cells": 2, "changed_files": []}
     assert made == {**about_now, "made_by": [by_now], "outdated_cells": []}
-    assert "made by other code" not in (whole.output / "report.html").read_text()
+    assert "made by different code" not in (whole.output / "report.html").read_text()
 
 
-def test_cells_of_other_code_are_used_named_and_run_anew_if_that_is_asked(
+def test_cells_of_different_code_are_used_named_and_run_again_if_that_is_asked(
     whole: Reproduced,
     tmp_path: Path,
     zest: Callable[..., dict[str, Any]],
@@ -318,19 +318,25 @@ def test_cells_of_other_code_are_used_named_and_run_anew_if_that_is_asked(
     assert (first["n_cells"], other["n_cells"], other["git_revisions"]) == (1, 1, ["abc"])
     assert other["changed_files"] == ["agents/dt.py", "agents/gone.py"]
     told = (
-        "Of 2 cells 1 were made by other code than the present (changed since: agents/dt.py, agents/gone.py): "
-        f"{outdated}. The same command with --rerun-outdated deletes them and runs them anew."
+        "Of 2 cells 1 were made by different code (changed since: agents/dt.py, agents/gone.py): "
+        f"{outdated}. The same command with --rerun-outdated deletes them and runs them again."
     )
     assert told in (copy / "report.html").read_text()
     cli.main(words)
     assert told in capsys.readouterr().err.replace("\n", " ")
     policy, kept = (cell(copy, agent) / "meta.json" for agent in ("dt", "bc"))
     before = policy.stat().st_mtime_ns, kept.stat().st_mtime_ns
-    anew = zest(*words, "--rerun-outdated")
-    assert (anew["n_cells_run"], anew["rows"], anew["code"]) == (1, whole.result["rows"], whole.result["code"])
+    again = zest(*words, "--rerun-outdated")
+    assert (again["n_cells_run"], again["rows"], again["code"]) == (1, whole.result["rows"], whole.result["code"])
     assert policy.stat().st_mtime_ns > before[0]
     assert kept.stat().st_mtime_ns == before[1]
     assert zest(*words, "--rerun-outdated")["n_cells_run"] == 0
+
+
+@pytest.mark.parametrize("name", ["multistep", "figures", "goal_count"])
+def test_what_has_no_cells_cannot_rerun_outdated_ones(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["reproduce", name, "--rerun-outdated"]) == 2
+    assert "--rerun-outdated is for recipes that compare methods, got" in capsys.readouterr().err
 
 
 def test_a_training_that_other_code_began_counts_for_both(

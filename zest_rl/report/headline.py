@@ -22,9 +22,9 @@ def headline(rows: Sequence[MethodRow], metas: Mapping[str, Mapping[str, Any]], 
     """
     contenders = [row for row in rows if row.kind == "method"]
     data = next((row for row in rows if row.kind == "dataset"), None)
-    clone = next((row for row in contenders if metas[row.method]["agent"] == "bc"), None)
+    clone = next((row for row in contenders if _clones_all(metas[row.method])), None)
     givers = {row.method: _giver(metas[row.method]) for row in contenders}
-    best = max((row for row in contenders if givers[row.method]), key=_mean, default=None)
+    best = max((row for row in contenders if givers[row.method]), key=lambda row: row.mean, default=None)
     if data is None or clone is None or best is None:
         return _best_sentence(contenders, n_datasets)
     where = f" of {n_datasets} datasets" if n_datasets > 1 else ""
@@ -40,25 +40,26 @@ def headline(rows: Sequence[MethodRow], metas: Mapping[str, Mapping[str, Any]], 
     return f"{trained} and {best.method}, which {rewards}, {best.mean:.0f} % {intervals}{doubt}."
 
 
-def _mean(row: MethodRow) -> float:
-    return row.mean
-
-
 def _interval(row: MethodRow) -> str:
     return f"{row.ci_low:.1f} to {row.ci_high:.1f}"
 
 
+def _clones_all(meta: Mapping[str, Any]) -> bool:
+    return bool(meta["agent"] == "bc" and meta["config"]["top_fraction"] == 1.0)
+
+
 def _giver(meta: Mapping[str, Any]) -> str:
-    """Say whose ZeST rewards a run learned from; empty for cloning, the ground truth, and shuffled scores."""
+    """Say whose ZeST rewards a run learned from; empty for cloning, no return, the ground truth, shuffled scores."""
     relabel = DatasetRecord.of_run(meta).relabel
-    if meta["agent"] == "bc" or relabel is None or relabel.shuffle is not None:
+    uses_return = meta["agent"] != "bc" and meta.get("config", {}).get("condition_on_return", True)
+    if not uses_return or relabel is None or relabel.shuffle is not None:
         return ""
     spec = relabel.scorer.goal
     return "a sentence" if spec == TASK_TEXT or spec.startswith(TEXT) else "a picture"
 
 
 def _best_sentence(contenders: Sequence[MethodRow], n_datasets: int) -> str:
-    best = max(contenders, key=_mean, default=None)
+    best = max(contenders, key=lambda row: row.mean, default=None)
     if best is None:
         return ""
     where = f" over {n_datasets} datasets" if n_datasets > 1 else ""

@@ -2,7 +2,7 @@
 
 What a recipe may hold is drawn in `comparison`, and in `study` for what trains nothing; with a key
 ``verb = "follow …"`` or ``"select …"`` it holds the arguments of that verb. Cells run side by side, one core each; a
-finished cell is run again only if that is asked, because other code made it (`code`).
+finished cell is run again only if that is asked, because different code made it (`code`).
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from zest_rl.cli.reproduce.comparison import read_comparison
 from zest_rl.cli.reproduce.pipeline import run_comparison
 from zest_rl.cli.reproduce.study import read_study, run_study
 from zest_rl.cli.ui import SilentUi, Ui
+from zest_rl.errors import BadInput
 
 VERBS = {
     f"{verb} {what}": (module, config)
@@ -43,7 +44,7 @@ class Config:
     n_workers: int | None = None
     """Cells side by side; default one per core."""
     rerun_outdated: bool = False
-    """Delete cells that other code than now's has made, and run them anew."""
+    """Delete the cells that different code has made, and run them again."""
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
@@ -69,7 +70,7 @@ def reproduce(
         file: the recipe; ``eval/demo.toml`` and its like come with the package, and ``demo`` alone will do.
         output: folder of runs, result.json, table.md and report.html; default runs/RECIPE.
         n_workers: cells side by side, default one per core.
-        rerun_outdated: delete cells that other code than now's has made, and run them anew.
+        rerun_outdated: delete the cells of a comparison that different code has made, and run them again.
         ui: told what happens; default nobody.
 
     Returns:
@@ -85,6 +86,10 @@ def reproduce(
     file = recipe_path(file, "reproduce")
     output = output or Path("runs") / file.stem
     recipe = read_recipe(file)
+    if rerun_outdated and "methods" not in recipe:
+        raise BadInput(
+            f"--rerun-outdated is for recipes that compare methods, got {file}, which trains nothing; leave it out"
+        )
     work: Callable[[], dict[str, Any]]
     if recipe.get("verb") in VERBS:
         work = _verb(recipe, f"recipe {file}", output, ui, n_workers)

@@ -115,13 +115,16 @@ def make_cells(comparison: Comparison, datasets: Mapping[str, TaskDatasets], out
 def run_cells(
     cells: list[Cell], output: Path, ui: Ui, *, n_workers: int | None = None, rerun_outdated: bool = False
 ) -> int:
-    """Train and evaluate all cells that are not done, or that other code made if that is asked; return how many."""
+    """Train and evaluate all cells that are not done, or that different code made if that is asked; return how many."""
     from zest_rl.runtime.parallel import cached_jobs
 
     done_folder = output / "done"
     for cell in cells if rerun_outdated else ():
         if cell.run.exists() and code.is_outdated(cell):
-            shutil.rmtree(cell.run)
+            gone = cell.run.with_name(f".{cell.run.name}.outdated")  # at once: half a run might pass for a whole one
+            shutil.rmtree(gone, ignore_errors=True)
+            cell.run.rename(gone)
+            shutil.rmtree(gone)
     open_cells = {cell.name: cell for cell in cells if not _is_done(cell, done_folder)}
     n_updates = {cell.run: cell.train.get("n_updates", 0) for cell in open_cells.values()}
     with (

@@ -17,7 +17,8 @@ from zest_rl.runtime import artifacts
 
 ROOMS = ("types.py", "data", "simulation", "kitchen", "embedders", "rewards", "agents", "training", "evaluation")
 """What a policy and its returns depend on. ``runtime`` decides where the work runs and how it is kept, ``metrics`` and
-``report`` what is made of finished cells, and relabeled rewards are in a cell's identity themselves."""
+``report`` what is made of finished cells, and relabeled rewards are in a cell's identity themselves. Versions of other
+packages are not recorded here; a run's ``meta.json`` has them."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,8 @@ class Code:
         return artifacts.hash_json(dict(self.files))
 
 
-class Recorded(Protocol):
-    """A cell, with where it is recorded which code made it."""
+class Cell(Protocol):
+    """What this module needs to know of `zest_rl.cli.reproduce.cells.Cell`, which imports it."""
 
     @property
     def name(self) -> str:
@@ -70,18 +71,18 @@ def _recorded(path: Path) -> list[Code]:
     return [Code(**code) for code in artifacts.read_json(path)] if path.exists() else []
 
 
-def codes_of(cell: Recorded) -> list[Code]:
+def codes_of(cell: Cell) -> list[Code]:
     """Return all codes that worked on a cell; none where versions made it that recorded none."""
     training, evaluation = map(_recorded, cell.code_records)
     return list({code.sha256: code for code in training + evaluation}.values()) if training and evaluation else []
 
 
-def is_outdated(cell: Recorded) -> bool:
-    """Whether other code than this process's worked on a cell, or unknown code."""
+def is_outdated(cell: Cell) -> bool:
+    """Whether code different from this process's worked on a cell, or unknown code."""
     return [code.sha256 for code in codes_of(cell)] != [code_now().sha256]
 
 
-def describe(cells: Iterable[Recorded]) -> dict[str, Any]:
+def describe(cells: Iterable[Cell]) -> dict[str, Any]:
     """Return as JSON the code of now, the codes that worked on the cells, and which cells these are where it differs.
 
     A cell counts for each code that worked on it; unknown code has no hash, and the revisions that its files name.
@@ -117,10 +118,7 @@ def _changed(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
 
 
 def caveats(code: Mapping[str, Any], n_cells: int) -> list[str]:
-    """Return a sentence about the outdated cells that `describe` found and how to run them anew; none if there is none.
-
-    It is one of the report's.
-    """
+    """Return the report's caveat about the outdated cells that `describe` found; none if there is none."""
     outdated: Sequence[str] = code["outdated_cells"]
     if not outdated:
         return []
@@ -129,6 +127,6 @@ def caveats(code: Mapping[str, Any], n_cells: int) -> list[str]:
     reasons = [f"changed since: {shortened(changed)}"] if changed else []
     reasons += ["a version that did not record it"] if any(made["source_sha256"] is None for made in others) else []
     return [
-        f"Of {n_cells} cells {len(outdated)} were made by other code than the present ({'; '.join(reasons)}): "
-        f"{shortened(outdated)}. The same command with --rerun-outdated deletes them and runs them anew."
+        f"Of {n_cells} cells {len(outdated)} were made by different code ({'; '.join(reasons)}): "
+        f"{shortened(outdated)}. The same command with --rerun-outdated deletes them and runs them again."
     ]

@@ -36,6 +36,7 @@ def run_comparison(
     from zest_rl.report.html import write_report
     from zest_rl.runtime import artifacts
 
+    code.code_now()  # as it is now: cells must not be called outdated because files change while they run
     stopwatch, was_finished = Stopwatch(output / "seconds.json"), (output / "report.html").exists()
     datasets = {task: _make_datasets(comparison, task, n_workers, stopwatch, ui) for task in comparison.collect}
     if not comparison.methods:
