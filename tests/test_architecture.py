@@ -18,7 +18,7 @@ ROOT = PACKAGE.parent
 
 ROOMS = (
     "errors", "types", "runtime", "metrics", "data", "simulation", "kitchen", "sources", "embedders", "rewards",
-    "export", "agents", "training", "evaluation", "analysis", "report", "cli",
+    "export", "agents", "training", "evaluation", "analysis", "report", "api", "cli",
 )  # fmt: skip
 """The pipeline: a module imports only from its own room and from those before it."""
 
@@ -67,9 +67,11 @@ def own_imports(tree: ast.AST) -> Iterator[str]:
 MODULES = {module_name(path): path for path in SOURCES}
 
 
-def test_the_package_is_its_rooms_and_three_files() -> None:
+def test_the_package_is_its_rooms_and_four_files() -> None:
     entries = [path for path in PACKAGE.iterdir() if path.name not in ("__pycache__", "py.typed")]
-    assert sorted(path.name for path in entries if path.is_file()) == ["__init__.py", "errors.py", "types.py"]
+    assert sorted(path.name for path in entries if path.is_file()) == [
+        "__init__.py", "api.py", "errors.py", "types.py",
+    ]  # fmt: skip
     assert {path.stem for path in entries} - {"__init__"} == set(ROOMS)
 
 
@@ -77,7 +79,9 @@ def test_the_package_is_its_rooms_and_three_files() -> None:
 def test_a_module_imports_only_from_its_own_room_and_those_before_it(name: str) -> None:
     imports = list(own_imports(ast.parse(MODULES[name].read_text())))
     if not name:
-        assert not imports, "zest_rl/__init__.py imports nothing of the package"
+        typed = next(node for node in ast.parse(MODULES[name].read_text()).body if isinstance(node, ast.If))
+        assert ast.unparse(typed.test) == "TYPE_CHECKING"
+        assert imports == list(own_imports(typed)), "zest_rl/__init__.py imports the package when it is used"
         return
     allowed = ROOMS[: ROOMS.index(room(name)) + 1]
     assert not [other for other in imports if room(other) not in allowed], f"{room(name)} comes before them"

@@ -1,0 +1,230 @@
+"""The verbs of the command line as functions with their arguments; ``import zest_rl`` offers them.
+
+A dataset is an id, the path of a file or folder that `zest relabel` takes, or what `collect` or `relabel` returned. A
+run is the folder that `train` returned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+
+from zest_rl.errors import BadInput, nearest
+
+if TYPE_CHECKING:
+    from zest_rl.agents import Policy
+    from zest_rl.analysis.cross_task import JointInspection
+    from zest_rl.data.reader import Dataset
+    from zest_rl.evaluation.evaluate import Evaluation
+    from zest_rl.export import Exported, Format
+    from zest_rl.kitchen.collect import Collected
+    from zest_rl.rewards.relabel import Relabeled
+    from zest_rl.training.loop import OnProgress
+
+Progress: TypeAlias = Callable[[int, int], None]
+"""Called with (parts done, parts in all)."""
+
+
+class HasDataset(Protocol):
+    """What a verb that writes a dataset returns."""
+
+    @property
+    def dataset_id(self) -> str:
+        """Id of the dataset."""
+
+
+AnyDataset: TypeAlias = str | Path | HasDataset
+
+
+def _id(dataset: AnyDataset) -> str:
+    return str(dataset) if isinstance(dataset, str | Path) else dataset.dataset_id
+
+
+def _configs(given: Mapping[str, Any], *kinds: type[Any]) -> list[Any]:
+    """Build configs of these kinds from the arguments of all of them.
+
+    Raises:
+        BadInput: an argument is of none, or a value is out of range.
+    """
+    names = [{field.name for field in fields(kind)} for kind in kinds]
+    if unknown := given.keys() - set().union(*names):
+        raise BadInput(f"unknown argument {min(unknown)!r}; {nearest(min(unknown), set().union(*names))}")
+    return [kind(**{name: given[name] for name in given.keys() & own}) for kind, own in zip(kinds, names, strict=True)]
+
+
+def collect(
+    task: str = "micro", *, n_workers: int | None = None, on_progress: Progress | None = None, **flags: Any
+) -> Collected:
+    """Collect a dataset of a kitchen task from an imperfect expert; see `zest_rl.kitchen.collect.collect_dataset`.
+
+    Args:
+        task: knob2, knob3, ldoor, rdoor, sdoor or micro.
+        n_workers: processes, default one per core.
+        on_progress: called with (episodes done, episodes in all).
+        **flags: the other fields of `zest_rl.kitchen.collect_config.CollectConfig`: n_episodes, noise_max, stop_share,
+            slow_max, bias_max, grip_max, level, seed, dataset.
+    """
+    from zest_rl.kitchen.collect import collect_dataset
+    from zest_rl.kitchen.collect_config import CollectConfig
+
+    (config,) = _configs({"task": task, **flags}, CollectConfig)
+    return collect_dataset(config, n_workers=n_workers, on_progress=on_progress or (lambda done, total: None))
+
+
+def relabel(dataset: AnyDataset, goal: str | Path = "same-scene", **flags: Any) -> Relabeled:
+    """Write a copy of a dataset whose rewards are ZeST scores; see `zest_rl.rewards.relabel.relabel`.
+
+    Args:
+        dataset: any that `zest relabel` takes.
+        goal: folder with ``init/`` and ``goal/``, "text:closed drawer -> open drawer", or for the kitchen "same-scene",
+            "toys", "text" or "drawings".
+        **flags: frames, camera, views, show_robot, tolerance, skip_incomplete, embedder, features, similarity,
+            precision, goal_share, reward, shuffle, device, n_workers, engine, on_start, on_progress.
+    """
+    from zest_rl.rewards.relabel import relabel as relabel_dataset
+
+    return relabel_dataset(_id(dataset), str(goal), **flags)
+
+
+def inspect(
+    *datasets: AnyDataset,
+    output: str | Path | None = None,
+    n_workers: int | None = None,
+    trust: bool = False,
+    on_progress: Progress | None = None,
+) -> JointInspection:
+    """Judge the rewards of relabeled datasets; see `zest_rl.analysis.cross_task.inspect_datasets`.
+
+    Args:
+        *datasets: relabeled ones.
+        output: also write the HTML page of `zest inspect`.
+        n_workers: processes that embed, default one per core.
+        trust: load the embedder that a dataset of somebody else names, now and from now on.
+        on_progress: called with (parts done, parts in all).
+    """
+    from zest_rl.analysis.cross_task import inspect_datasets
+    from zest_rl.report.html import write_report
+    from zest_rl.report.inspection_page import inspection_report
+
+    ids, progress = [_id(dataset) for dataset in datasets], on_progress or (lambda done, total: None)
+    inspected = inspect_datasets(ids, n_workers=n_workers, trust=trust, on_progress=progress)
+    if output is not None:
+        write_report(inspection_report(inspected), Path(output))
+    return inspected
+
+
+def train(
+    agent: str,
+    dataset: AnyDataset,
+    *,
+    run_dir: str | Path | None = None,
+    on_progress: OnProgress | None = None,
+    **flags: Any,
+) -> Path:
+    """Train a policy, or go on with an interrupted run, and return its folder; see `zest_rl.training.runs.train`.
+
+    Args:
+        agent: bc, dt or rvs.
+        dataset: its rewards are the only information about quality.
+        run_dir: folder of this run alone; default ``runs/DATASET-AGENT-seedN``.
+        on_progress: called after every logged row.
+        **flags: the fields of `zest_rl.training.loop.TrainingConfig` (n_updates, seed, device, …) and of the agent's
+            config (`zest_rl.agents.dt.DTConfig`, …).
+    """
+    from zest_rl.agents import get_agent
+    from zest_rl.training.loop import TrainingConfig
+    from zest_rl.training.runs import train as train_run
+
+    agent_config, config = _configs(flags, get_agent(agent).config, TrainingConfig)
+    folder = None if run_dir is None else Path(run_dir)
+    return train_run(agent, _id(dataset), agent_config, config, run_dir=folder, on_progress=on_progress)
+
+
+def evaluate(
+    run: str | Path,
+    *,
+    score: bool = False,
+    videos: bool = False,
+    device: str = "cpu",
+    n_workers: int | None = None,
+    trust: bool = False,
+    on_progress: Callable[[int], None] | None = None,
+    **flags: Any,
+) -> Evaluation:
+    """Roll a policy out in the environment of its dataset; see `zest_rl.evaluation.evaluate.evaluate`.
+
+    Args:
+        run: what `train` returned.
+        score: record ZeST scores even if the policy does not need them.
+        videos: write videos of the best, median and worst episode.
+        device: where the policy runs.
+        n_workers: processes, default one per core.
+        trust: run the policy, and load the embedder, that a run of somebody else names, now and from now on.
+        on_progress: called with the number of episodes finished since the last call.
+        **flags: the fields of `zest_rl.evaluation.evaluate.EvaluationConfig`: n_episodes, seed, rtg, target_quantile.
+    """
+    from zest_rl.evaluation.evaluate import EvaluationConfig
+    from zest_rl.evaluation.evaluate import evaluate as evaluate_run
+
+    (config,) = _configs(flags, EvaluationConfig)
+    return evaluate_run(
+        Path(run),
+        config,
+        score=score,
+        videos=videos,
+        device=device,
+        n_workers=n_workers,
+        trust=trust,
+        on_progress=on_progress,
+    )
+
+
+def report(
+    *runs: str | Path,
+    output: str | Path = "report.html",
+    title: str = "ZeST rewards for offline robot learning",
+    trust: bool = False,
+) -> Path:
+    """Compare evaluated runs of one task in one HTML file, and return its path.
+
+    Args:
+        *runs: evaluated; those that differ in their seed alone become one row.
+        output: the file.
+        title: its headline.
+        trust: load the embedder that a dataset of somebody else names, now and from now on.
+    """
+    from zest_rl.report.comparison_page import compare_runs
+    from zest_rl.report.html import write_report
+
+    return write_report(compare_runs([Path(run) for run in runs], title=title, trust=trust), Path(output))
+
+
+def export(dataset: AnyDataset, to: Format = "npz", output: str | Path | None = None, **flags: Any) -> Exported:
+    """Write a dataset in another format; see `zest_rl.export.export`.
+
+    Args:
+        dataset: relabeled or not.
+        to: npz, d4rl, robomimic, d3rlpy, torchrl, lerobot or lerobot-progress.
+        output: the file or folder, which must not exist; default DATASET.FORMAT here.
+        **flags: shape, normalise, fps.
+    """
+    from zest_rl.export import export as export_dataset
+
+    return export_dataset(_id(dataset), to, None if output is None else Path(output), **flags)
+
+
+def load_policy(run: str | Path, device: str = "cpu", *, trust: bool = False) -> Policy:
+    """Return the policy of a finished run, to act with; see `zest_rl.agents.load_policy`."""
+    from zest_rl.agents import load_policy as load
+
+    return load(Path(run), device, trust=trust)
+
+
+def open_dataset(dataset: AnyDataset) -> AbstractContextManager[Dataset]:
+    """Open a dataset to read its episodes, scores and states; see `zest_rl.data.reader.open_dataset`."""
+    from zest_rl.data.reader import open_dataset as open_id
+
+    return open_id(_id(dataset))
