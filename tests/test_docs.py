@@ -1,0 +1,44 @@
+"""The README is short, and everything that a page links to exists."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("*/README.md")})
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+CODE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+
+
+def links(text: str) -> list[str]:
+    return [link for link in LINK.findall(CODE.sub("", text)) if "://" not in link]
+
+
+def anchors(text: str) -> list[str]:
+    """The names that GitHub gives to headings."""
+    headings = re.findall(r"^#+ (.+)$", CODE.sub("", text), re.MULTILINE)
+    return [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_files_and_headings_that_a_page_links_to_exist(page: Path) -> None:
+    for link in links(page.read_text(encoding="utf-8")):
+        name, _, anchor = link.partition("#")
+        target = (page.parent / name).resolve() if name else page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target.read_text(encoding="utf-8")), link
+
+
+def test_the_readme_leads_to_every_page_of_the_docs() -> None:
+    linked = {(ROOT / link.partition("#")[0]).resolve() for link in links(README)}
+    assert {page for page in PAGES if page.parent.name == "docs"} <= linked
+
+
+def test_the_readme_has_120_lines_and_80_words_before_the_first_command() -> None:
+    assert len(README.splitlines()) <= 120
+    words = re.findall(r"\w+", re.sub(r"!\[.*?\]\(.*?\)", "", README.partition("```")[0]))
+    assert len(words) <= 80
