@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 from read_dataset import read
+from tiny_comparison import RECIPE, write
 
 from zest_rl import cli
 from zest_rl.cli import reproduce
@@ -27,59 +28,6 @@ from zest_rl.data import reader
 from zest_rl.kitchen import calibration
 from zest_rl.report import methods
 from zest_rl.runtime import artifacts
-
-RECIPE = """
-title = "A tiny comparison"
-seeds = [0]
-caveats = ["Tiny."]
-paper_demo = 81.19
-
-[collect]
-task = "micro"
-n_episodes = 4
-noise_max = 1.0
-dataset = "zest/kitchen-micro-whole-v0"
-
-[relabel]
-views = 1
-tolerance = 0.05
-
-[goals.scene]
-goal = "same-scene"
-
-[train]
-n_updates = 20
-hidden_size = 32
-n_layers = 1
-warmup_updates = 0
-log-every = 10
-[train.dt]
-context_len = 5
-snapshot_every = 10
-
-[methods.BC]
-agent = "bc"
-goal = "scene"
-kind = "control"
-paper = 80.67
-
-[methods."ZeST+DT"]
-agent = "dt"
-goal = "scene"
-
-[evaluate]
-n_episodes = 2
-videos = false
-"""
-
-
-TASK_AND_SIZE = 'task = "micro"\nn_episodes = 4'
-
-
-def write(folder: Path, text: str) -> Path:
-    path = folder / "tiny.toml"
-    path.write_text(text)
-    return path
 
 
 @dataclass(frozen=True)
@@ -388,87 +336,6 @@ def test_a_policy_that_was_trained_elsewhere_is_a_method_like_the_others(
     torch.jit.trace(torch.nn.Linear(59, 9), torch.zeros(1, 59)).save(str(tmp_path / "micro-0.pt"))
     assert reproduce.reproduce(recipe, output, n_workers=1)["n_cells_run"] == 1, "another file is another policy"
     assert len(list((output / "cells").glob("micro-foreign-scene-seed0-*"))) == 2
-
-
-def test_one_task_may_have_several_datasets(tmp_path: Path) -> None:
-    tables = "".join(
-        f"[tasks.at-{level}]\ntask = 'micro'\nlevel = {level}\ndataset = 'zest/at-{level}-v0'\n" for level in (60, 95)
-    )
-    shared = RECIPE.replace('task = "micro"\n', "").replace('dataset = "zest/kitchen-micro-whole-v0"\n', "")
-    comparison = read_comparison(write(tmp_path, shared.replace("[relabel]", f"{tables}\n[relabel]")))
-    assert {name: (config.task, config.level) for name, config in comparison.collect.items()} == {
-        "at-60": ("micro", 60.0),
-        "at-95": ("micro", 95.0),
-    }
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "complaint"),
-    [
-        ('goal = "same-scene"', 'goal = "same-scene"\ngoal_share = 7.0', "goal_share must be in"),
-        ("[evaluate]", "[evalute]", "unknown key 'evalute'; did you mean 'evaluate'"),
-        ('title = "A tiny comparison"', "", "'title' is required"),
-        ('title = "A tiny comparison"', 'verb = "train dt"', "is for `zest train dt --recipe"),
-        ('title = "A tiny comparison"', 'verb = "select goals"', "unknown key 'collect'"),
-        ("seeds = [0]", 'seeds = ["0"]', "'seeds' must be a list of an integer, got ['0']"),
-        ("seeds = [0]", "seeds = [0, 0]", "seeds must be at least 1 number, all different"),
-        ('agent = "bc"', 'agent = "bc"\nseeds = [1]', "seeds must be some of the recipe's seeds [0], got [1]"),
-        ('agent = "bc"', 'agent = "bc"\nseeds = []', "[methods.'BC']: seeds must be some of"),
-        ("[relabel]", "[relabel.all]", "[goals.'scene']: unknown key 'all'"),
-        ("[methods.BC]", "[methods]", "'methods' must be a table of tables"),
-        ("[train.dt]", "[train.bcc]", "unknown key 'bcc'"),
-        (TASK_AND_SIZE, '[tasks.report]\ntask = "micro"', "the name becomes a file's beside report.html"),
-        ("[relabel]", "[tasks.micro]\n[relabel]", "[collect]: 'task' is not for a recipe to set"),
-        ('task = "micro"', 'task = "mirco"', "[collect]: unknown task 'mirco'; did you mean 'micro'"),
-        ("noise_max = 1.0", "noise_max = 3.0", "[collect]: noise_max must be in [0, 2.0], got 3.0"),
-        ("n_episodes = 4", "n_episodes = 4\nlevel = 0", "level must be in (0, 100] percent of the expert, got 0.0"),
-        ('goal = "same-scene"', 'goal = "same-scen"', "[goals.'scene']: unknown goal 'same-scen'"),
-        ('goal = "same-scene"', 'goal = "visual-tasks:real_imgs"', "set it to your copy of the Visual Tasks Dataset"),
-        (TASK_AND_SIZE, "[tasks.micro]\nn_episodes = 3\n[tasks.sdoor]\nn_episodes = 4", "every task needs as many"),
-        (TASK_AND_SIZE, '[tasks."a/b"]\ntask = "micro"', "the name becomes a file's"),
-        (TASK_AND_SIZE, "[tasks.mirco]", "unknown task 'mirco'; did you mean 'micro'"),
-        ("noise_max = 1.0", "noise-maxx = 1.0", "[collect]: unknown key 'noise-maxx'; did you mean 'noise-max'"),
-        ("n_updates = 20", 'n_updates = "many"', "'n_updates' must be an integer, got 'many'"),
-        ("hidden_size = 32", "hidden_size = 0", "hidden_size must be 1 to 16384, got 0"),
-        ('agent = "bc"', "", "[methods.'BC']: a method has either an agent or a policy, got None and None"),
-        ('agent = "bc"', 'agent = "bcc"', "unknown agent 'bcc'; did you mean 'bc'"),
-        ('kind = "control"', 'kind = "baseline"', "'kind' must be one of 'method', 'control', got 'baseline'"),
-        ("context_len = 5", "contextlen = 5", "unknown key 'contextlen'; did you mean 'context-len'"),
-        ("context_len = 5", 'dataset = "zest/x-v0"', "'dataset' is not for a recipe to set"),
-        ('"dt"\ngoal = "scene"', '"dt"\ngoal = "sceen"', "unknown goal 'sceen'; did you mean 'scene'"),
-        ("n_episodes = 2", "n_episodes = 0", "n_episodes must be at least 1, got 0"),
-        ("n_episodes = 2", 'rtg = "offline"', "'rtg' must be one of 'online', 'constant', 'schedule', got 'offline'"),
-        ('agent = "bc"', 'agent = "bc"\npolicy = "onnx:x"', "either an agent or a policy, got 'bc' and 'onnx:x'"),
-        ('agent = "bc"', 'policy = "onnx:x"\nhidden_size = 1', "[methods.'BC']: unknown key 'hidden_size'"),
-        ('agent = "bc"', 'policy = "onxn:x"', "[methods.'BC']: unknown kind of policy 'onxn'; did you mean 'onnx'?"),
-        ('agent = "bc"', 'policy = "d3rlpy:x.d3"', "[methods.'BC']: a Python belongs to d3rlpy:FILE.d3"),
-        ('agent = "bc"', 'policy = "onnx:x"\nseed = 1', "'seed' is not for a recipe to set"),
-        (
-            "[relabel]",
-            '[tasks.micro]\n[tasks.sdoor]\n[methods.A]\npolicy = "onnx:x"\n[relabel]',
-            "must hold {task}, got",
-        ),
-        ("seeds = [0]", 'seeds = [0, 1]\nmethods.A.policy = "onnx:x"', "the policy must hold {seed}, got 'onnx:x'"),
-    ],
-)
-def test_a_bad_recipe_is_refused_before_anything_runs(
-    old: str,
-    new: str,
-    complaint: str,
-    refusal: Callable[..., tuple[int, str]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
-    monkeypatch.delenv("ZEST_VISUAL_TASKS", raising=False)
-    assert RECIPE.count(old) == 1
-    recipe = write(tmp_path, RECIPE.replace(old, new))
-    code, message = refusal("reproduce", recipe, "--output", tmp_path / "out")
-    assert code == 2
-    assert complaint in message
-    assert str(recipe) in message
-    assert list(tmp_path.iterdir()) == [recipe]
 
 
 def test_several_tasks_make_a_page_each_and_one_over_all_and_share_what_is_equal(

@@ -20,8 +20,10 @@ if importlib.util.find_spec("triton"):
     if "triton" not in sys.modules and _maps.exists() and b"libLLVM" in _maps.read_bytes():
         _flags = sys.getdlopenflags()
         sys.setdlopenflags(_flags | os.RTLD_DEEPBIND)
-        importlib.import_module("triton._C.libtriton")
-        sys.setdlopenflags(_flags)
+        try:
+            importlib.import_module("triton._C.libtriton")
+        finally:
+            sys.setdlopenflags(_flags)
     importlib.import_module("triton")
 try:
     importlib.import_module("mujoco")
