@@ -55,7 +55,9 @@ class Canvas:
         Raises:
             ZestError: no GL backend works.
         """
-        self._model, self._cameras = model, cameras
+        self.cameras = cameras
+        """May be exchanged between frames."""
+        self._model = model
         self._rect = mujoco.MjrRect(0, 0, size, size)
         self._option, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
         self._scene = mujoco.MjvScene(model, maxgeom=2 * model.ngeom + model.nsite + _MORE_GEOMS)
@@ -67,11 +69,28 @@ class Canvas:
         """Leave the background black; a model's sky may hold random specks."""
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = False
 
+    def hide_marks(self) -> None:
+        """Leave out sites and tendons, which mark goals and drive robots."""
+        self._option.sitegroup[:] = self._option.tendongroup[:] = 0
+
+    def segments(self, data: mujoco.MjData) -> NDArray[np.int32]:
+        """Return which geom each pixel shows, (V, H, W) int32; −1 for what is no geom."""
+        flags = self._scene.flags
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
+        colours = self.draw(data).astype(np.int32)
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
+        drawn = self._scene.geoms[: self._scene.ngeom]
+        geoms = np.full(len(drawn) + 1, -1, np.int32)
+        for geom in drawn:
+            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.segid >= 0:
+                geoms[geom.segid + 1] = geom.objid
+        return geoms[colours @ np.array([1, 256, 65536], np.int32)]
+
     def draw(self, data: mujoco.MjData) -> NDArray[np.uint8]:
         """Draw one state after its kinematics are computed: (V, H, W, 3) uint8 RGB."""
         self._gl.make_current()
-        frames = np.empty((len(self._cameras), self._rect.height, self._rect.width, 3), np.uint8)
-        for frame, camera in zip(frames, self._cameras, strict=True):
+        frames = np.empty((len(self.cameras), self._rect.height, self._rect.width, 3), np.uint8)
+        for frame, camera in zip(frames, self.cameras, strict=True):
             mujoco.mjv_updateScene(
                 self._model, data, self._option, self._perturb, camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
             )

@@ -12,6 +12,28 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.errors import BadInput
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """What of a model is shown, and from where; bodies by name, empty: by the rules of `zest_rl.simulation.bodies`."""
+
+    robot: tuple[str, ...] = ()
+    """Bodies that are hidden, with everything below them."""
+    look_at: str | None = None
+    """Body in the middle of the views."""
+    show_robot: bool = False
+    n_views: int = 8
+    tolerance: float = 1e-3
+    """Grid on which joint positions are rounded, in rad or m; 0: no rounding."""
+
+    def __post_init__(self) -> None:
+        if self.show_robot and self.robot:
+            raise BadInput("--robot names bodies that are hidden, --show-robot hides none; give one of them")
+        if not 0 <= self.tolerance < np.inf:
+            raise BadInput(f"tolerance must be a finite number >= 0 (rad or m), got {self.tolerance}")
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:

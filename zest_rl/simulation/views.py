@@ -47,7 +47,7 @@ def ring(
     )
 
 
-def on_grid(qpos: NDArray[np.float64], visible: slice, tolerance: float) -> NDArray[np.float64]:
+def on_grid(qpos: NDArray[np.float64], visible: slice | NDArray[np.bool_], tolerance: float) -> NDArray[np.float64]:
     """Round states to a grid and zero what no frame depends on: (N, nq) → (N, nq); equal rows have equal frames.
 
     Args:

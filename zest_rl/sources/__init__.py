@@ -4,7 +4,8 @@
 |---|---|---|
 | Minari dataset of zest/Kitchen-v1 | copied | its states, rendered from a ring of views (`kitchen`) |
 | Minari dataset with pictures among its observations | copied | those (`pictures`) |
-| Minari dataset with recorded MuJoCo states, or with `--camera NAME` | copied | rendered from the model (`states`) |
+| Minari dataset with recorded MuJoCo states | copied | what is moved, without the robot, from a ring (`scenes`) |
+| the same with `--camera NAME` or `default` | copied | rendered with everything in it (`states`) |
 | any of these with `--frames FOLDER …` | | videos or pictures in a folder (`videos`) |
 | robomimic's HDF5 | imported (`robomimic`) | its pictures |
 | LeRobot v3 folder | imported (`lerobot`) | its videos, or pictures (`parquet_pictures`) |
@@ -12,7 +13,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -22,12 +23,17 @@ from zest_rl.data.writer import DatasetCopy, Trajectories
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.views import Views
 from zest_rl.runtime.files import is_there, user_path
+from zest_rl.simulation.scene import SceneConfig
 from zest_rl.sources.base import EpisodeFrames, Source
 from zest_rl.sources.kitchen import KitchenStates, read_kitchen
 from zest_rl.sources.pictures import Pictures, picture_entries
 from zest_rl.sources.videos import find_videos
 
 __all__ = ["EpisodeFrames", "KitchenStates", "Source", "open_source"]
+
+
+OWN_CAMERA = ("default",)
+"""The cameras that stand for the environment's own one."""
 
 
 def _is_path(dataset: str) -> bool:
@@ -44,6 +50,8 @@ def open_source(
     *,
     frames: Sequence[str] = (),
     cameras: Sequence[str] = (),
+    robot: Sequence[str] = (),
+    look_at: str | None = None,
     n_views: int = Views.n_views,
     show_robot: bool = Views.robot,
     tolerance: float = Views.tolerance,
@@ -55,28 +63,31 @@ def open_source(
         dataset: a Minari id, or the path of a robomimic file or a LeRobot folder.
         frames: entries with pictures, or folders with videos, one per view; empty: the only pictures, else the
             recorded states.
-        cameras: of the environment's model, one per view, to render the recorded states from.
-        n_views: kitchen only: cameras around the object.
-        show_robot: kitchen only: keep the robot in view.
-        tolerance: kitchen only: grid of the states, see `Views`.
+        cameras: of the environment's model, one per view, to render the recorded states from, with the robot in view;
+            or ``default``, the environment's own. Empty: a ring of views round what is moved.
+        robot: scenes only: bodies that are hidden; empty: what is driven.
+        look_at: scenes only: body in the middle of the views; None: the one that moves most.
+        n_views: scenes and kitchen only: cameras around the object.
+        show_robot: scenes and kitchen only: keep the robot in view.
+        tolerance: scenes and kitchen only: grid of the states.
         skip_incomplete: LeRobot only: leave out episodes without steps, and those whose files are missing.
 
     Raises:
         BadInput: no such dataset, or its frames are missing or ambiguous; the message lists the candidates.
     """
     with nullcontext() if _is_path(dataset) else reader.open_dataset(dataset) as ds:
-        if ds is not None and ds.record.task is not None and not (frames or cameras):
-            return read_kitchen(ds, Views(ds.record.task, n_views, robot=show_robot, tolerance=tolerance))
+        of_scenes = {"--robot": bool(robot), "--look-at": look_at is not None}
         rendering = {
+            **of_scenes,
             "--views": n_views != Views.n_views,
             "--show-robot": show_robot != Views.robot,
             "--tolerance": tolerance != Views.tolerance,
         }
-        if any(rendering.values()):
-            flags = " and ".join(flag for flag, given in rendering.items() if given)
-            raise BadInput(
-                f"{flags} belong to the kitchen's own renderer, not to frames from elsewhere; leave them out"
-            )
+        if ds is not None and ds.record.task is not None and not (frames or cameras):
+            _refuse(of_scenes, "are not for zest/Kitchen-v1, whose robot and objects are known")
+            return read_kitchen(ds, Views(ds.record.task, n_views, robot=show_robot, tolerance=tolerance))
+        if frames or cameras or ds is None:
+            _refuse(rendering, "belong to the ring of views round an object, which needs recorded MuJoCo states alone")
         if frames and cameras:
             raise BadInput("--camera renders recorded states, --frames says where pictures are; give one of them")
         if skip_incomplete and (ds is not None or not user_path(dataset).is_dir()):
@@ -94,7 +105,8 @@ def open_source(
                 user_path(dataset), keys, with_frames=not folders, skip_incomplete=skip_incomplete
             )
         else:
-            episode_frames = None if folders else _minari_frames(ds, keys, cameras)
+            scene = SceneConfig(tuple(robot), look_at, show_robot, n_views, tolerance)
+            episode_frames = None if folders else _minari_frames(ds, keys, cameras, scene)
             trajectories = DatasetCopy.of(ds)
     if folders:
         episode_frames = find_videos(folders, len(trajectories.n_steps), dataset)
@@ -119,14 +131,26 @@ def _open_path(
     return open_robomimic(path, keys, with_frames=with_frames)
 
 
-def _minari_frames(ds: reader.Dataset, keys: Sequence[str], cameras: Sequence[str]) -> EpisodeFrames:
+def _refuse(flags: Mapping[str, bool], why: str) -> None:
+    if given := [flag for flag, is_given in flags.items() if is_given]:
+        raise BadInput(f"{' and '.join(given)} {why}; leave them out")
+
+
+def _minari_frames(
+    ds: reader.Dataset, keys: Sequence[str], cameras: Sequence[str], scene: SceneConfig
+) -> EpisodeFrames:
     names = list(ds.groups)
     pictures = picture_entries(ds.file, f"{names[0]}/observations")
-    if cameras or not (keys or any(form.channels for form in pictures.values())):
+    rendered = cameras or scene != SceneConfig() or not (keys or any(form.channels for form in pictures.values()))
+    if rendered:
+        from zest_rl.sources.scenes import find_scene
         from zest_rl.sources.states import find_states
 
+        what, env_spec = f"dataset {ds.id}", ds.record.env_spec
         try:
-            return find_states(ds.file, names, ds.record.env_spec, cameras, f"dataset {ds.id}")
+            if cameras:
+                return find_states(ds.file, names, env_spec, () if tuple(cameras) == OWN_CAMERA else cameras, what)
+            return find_scene(ds.file, names, env_spec, scene, what)
         except BadInput as error:
             raise BadInput(f"{error}{rejected(pictures, 'observations')}") from error
     chosen = choose_pictures(pictures, keys, f"dataset {ds.id}", "observations")

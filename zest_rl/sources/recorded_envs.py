@@ -18,6 +18,10 @@ Doubles = NDArray[np.float64]
 Columns = tuple[tuple[str, int, int | None], ...]
 """Paths within an episode and the columns that make up qpos, in order: from the first number up to, but without, the
 second; None: to the end."""
+MODEL_FIELDS = ("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "geom_rgba", "mat_rgba")
+"""Of a model, what an environment may change at its reset, so that frames depend on it."""
+DATA_FIELDS = ("qpos", "mocap_pos", "mocap_quat")
+"""Of the simulator's data, what frames depend on."""
 State = Mapping[str, Doubles]
 """``qpos`` (nq,), and everything else in the scene by the last part of its path."""
 
@@ -34,6 +38,8 @@ class RecordedEnv:
     """Restores a state in the environment; None: a frame depends on qpos alone."""
     scenery: Callable[[Any], tuple[str, ...]] = lambda env: ()
     """Environment → paths of what `put` needs besides qpos; ``{folder}`` is the group in which qpos is recorded."""
+    moves_bodies: bool = False
+    """Whether `put` places bodies without a joint, rather than marks alone."""
     noise: tuple[str, ...] = ()
     """Arguments of the environment that add noise to its observations unless they are 0."""
 
@@ -45,10 +51,12 @@ class RecordedEnv:
 
     def put_state(self, env: Any, state: State) -> None:
         """Restore a recorded state in the environment, without computing positions in the world."""
-        if self.put is None:
-            env.data.qpos[:] = state["qpos"]
-        else:
+        if self.put is not None and all(path.rpartition("/")[2] in state for path in self.scenery(env)):
             self.put(env, state)
+            return
+        for owner, names in ((env.model, MODEL_FIELDS), (env.data, DATA_FIELDS)):
+            for name in set(names) & set(state):
+                getattr(owner, name).flat = state[name]
 
 
 def _put_hand(env: Any, state: State) -> None:
@@ -98,7 +106,7 @@ RECORDED_ENVS = (
     RecordedEnv(f"{_ROBOTICS}maze.point_maze", _POINT, _put_maze, _goal),
     RecordedEnv(f"{_ROBOTICS}maze.ant_maze", _ANT, _put_maze, _goal),
     RecordedEnv(f"{_ROBOTICS}maze.", None, _put_maze, _goal),
-    RecordedEnv(f"{_ROBOTICS}adroit_hand.", None, _put_hand, _hand_scenery),
+    RecordedEnv(f"{_ROBOTICS}adroit_hand.", None, _put_hand, _hand_scenery, moves_bodies=True),
     RecordedEnv(f"{_ROBOTICS}fetch.", None, _put_fetch, _goal),
     # by default its observations are off by up to 0.001 rad, and 0.00005 rad or m
     RecordedEnv(f"{_ROBOTICS}franka_kitchen", _KITCHEN, noise=("robot_noise_ratio", "object_noise_ratio")),

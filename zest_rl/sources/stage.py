@@ -32,25 +32,44 @@ Pose = tuple[tuple[float, float, float], float, float, float]
 """Point that a camera looks at and distance from it in metres, azimuth and elevation in degrees."""
 
 
-class Stage:
-    """One environment, and cameras that look at its model."""
+class Simulation:
+    """An environment in which recorded states are restored."""
 
-    def __init__(self, env: Any, entry_point: str, cameras: tuple[str, ...]) -> None:
-        """Open a GL context; see `stage_of`."""
+    def __init__(self, env: Any, entry_point: str) -> None:
+        """Take an environment without its wrappers; see `simulation_of`."""
         self.env, self.model, self.data = env, env.model, env.data
         compiled = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
         mujoco.mj_saveModel(self.model, None, compiled)
         self.model_sha256 = artifacts.hash_arrays(compiled)
+        self.entry_point, self.recorded = entry_point, recorded_env(entry_point)
+
+    def put(self, state: State) -> None:
+        """Restore a recorded state, and compute positions in the world."""
+        self.recorded.put_state(self.env, state)
+        mujoco.mj_fwdPosition(self.model, self.data)
+
+    def open_canvas(self, cameras: tuple[mujoco.MjvCamera, ...]) -> Canvas:
+        """Open a GL context, without what costs time and shows nothing; it stays open until the process ends."""
         visual = self.model.vis
         visual.global_.offwidth = visual.global_.offheight = SIZE
         visual.quality.shadowsize = visual.quality.offsamples = 0
-        self._recorded = recorded_env(entry_point)
-        self.scenery = self._recorded.scenery(env)
-        """Paths of what `render` needs besides qpos, see `RecordedEnv`."""
-        if self._recorded.put is None and hasattr(env, "_render_callback"):
+        canvas = Canvas(self.model, cameras, SIZE)
+        canvas.hide_sky()
+        atexit.register(canvas.close)
+        return canvas
+
+
+class Stage:
+    """One environment, and cameras that look at its model."""
+
+    def __init__(self, simulation: Simulation, cameras: tuple[str, ...]) -> None:
+        """Open a GL context; see `stage_of`."""
+        self.simulation = simulation
+        env, model = simulation.env, simulation.model
+        if simulation.recorded.put is None and hasattr(env, "_render_callback"):
             raise BadInput(
-                f"{entry_point} places targets only while it renders, in a way that is not known here; give --frames "
-                "FOLDER with a video of each episode"
+                f"{simulation.entry_point} places targets only while it renders, in a way that is not known here; give "
+                "--frames FOLDER with a video of each episode"
             )
         self._renderer = _renderer_of(env)
         self._default = mujoco.MjvCamera()
@@ -59,20 +78,18 @@ class Stage:
         """Whether the environment was made with a camera of the model as its default."""
         if self.is_fixed:
             self._default.type, self._default.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, fixed
-        views = tuple(_camera(self.model, name) for name in cameras) or (self._default,)
-        self._canvas = Canvas(self.model, views, SIZE)
-        self._canvas.hide_sky()
+        self._canvas = simulation.open_canvas(tuple(_camera(model, name) for name in cameras) or (self._default,))
 
     def default_pose(self, state: State) -> Pose:
         """Return the pose of the camera of ``env.render()`` when this state is the first one rendered.
 
         As in Gymnasium's `OffScreenViewer` and `MujocoRenderer`; the camera does not follow what moves.
         """
-        self._put(state)
-        camera = mujoco.MjvCamera()
-        x, y, z = np.median(self.data.geom_xpos, axis=0).tolist()
+        self.simulation.put(state)
+        camera, model = mujoco.MjvCamera(), self.simulation.model
+        x, y, z = np.median(self.simulation.data.geom_xpos, axis=0).tolist()
         settings = getattr(self._renderer, "default_cam_config", None) or {}
-        camera.lookat, camera.distance = settings.get("lookat", (x, y, z)), self.model.stat.extent
+        camera.lookat, camera.distance = settings.get("lookat", (x, y, z)), model.stat.extent
         for field in ("distance", "azimuth", "elevation"):
             if field in settings:
                 setattr(camera, field, settings[field])
@@ -81,18 +98,10 @@ class Stage:
 
     def render(self, state: State, pose: Pose | None = None) -> list[Frame]:
         """Draw one state: one (H, W, 3) frame per camera; `pose` is that of the default camera."""
-        self._put(state)
+        self.simulation.put(state)
         if pose is not None:
             self._default.lookat, self._default.distance, self._default.azimuth, self._default.elevation = pose
-        return list(self._canvas.draw(self.data))
-
-    def _put(self, state: State) -> None:
-        self._recorded.put_state(self.env, state)
-        mujoco.mj_fwdPosition(self.model, self.data)
-
-    def close(self) -> None:
-        """Free the GL context."""
-        self._canvas.close()
+        return list(self._canvas.draw(self.simulation.data))
 
 
 @functools.cache
@@ -100,8 +109,18 @@ def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
     """Return this process's stage, open until the process ends.
 
     Raises:
-        BadInput: not an EnvSpec, not a registered environment, or one without a MuJoCo model or such a camera.
-        ZestError: the environment cannot be made with the packages here, or no GL backend works.
+        BadInput: as `make_simulation`, or there is no such camera.
+        ZestError: as `make_simulation`, or no GL backend works.
+    """
+    return Stage(make_simulation(env_spec), cameras)
+
+
+def make_simulation(env_spec: str) -> Simulation:
+    """Make the environment of a dataset.
+
+    Raises:
+        BadInput: not an EnvSpec, not a registered environment, or one without a MuJoCo model.
+        ZestError: the environment cannot be made with the packages here.
     """
     try:
         spec = gymnasium.envs.registration.EnvSpec.from_json(without_wrappers(env_spec))
@@ -125,9 +144,7 @@ def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
         ) from error
     if not isinstance(getattr(env, "model", None), mujoco.MjModel):
         raise BadInput(f"{spec.id} has no MuJoCo model to render; give --frames FOLDER with a video of each episode")
-    stage = Stage(env, str(spec.entry_point), cameras)
-    atexit.register(stage.close)
-    return stage
+    return Simulation(env, str(spec.entry_point))
 
 
 def _renderer_of(env: Any) -> Any:

@@ -24,8 +24,8 @@ from zest_rl.data.observations import entries
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.sources import state_plugins
-from zest_rl.sources.recorded_envs import Columns, Doubles, RecordedEnv, recorded_env
-from zest_rl.sources.stage import SIZE, Pose, stage_of
+from zest_rl.sources.recorded_envs import DATA_FIELDS, MODEL_FIELDS, Columns, Doubles, RecordedEnv
+from zest_rl.sources.stage import SIZE, Pose, Simulation, stage_of
 from zest_rl.types import Frame, check_finite
 
 _VERSION = 2  # raise it when a pixel changes, here or in stage.py: cached embeddings depend on it
@@ -72,11 +72,14 @@ class States:
 
     def digest(self, episode: int) -> str:
         """Hash the states, the environment with its versions and its model, and the cameras."""
-        versions = [importlib.metadata.version(name) for name in ("mujoco", "gymnasium", "gymnasium-robotics")]
         recorded = self.read_states(episode)
-        model = stage_of(self.env_spec, self.cameras).model_sha256
-        settings = [self.env_spec, versions, model, self.cameras, self.pose, SIZE, _VERSION, sorted(recorded)]
+        model = stage_of(self.env_spec, self.cameras).simulation.model_sha256
+        settings = [self.env_spec, versions(), model, self.cameras, self.pose, SIZE, _VERSION, sorted(recorded)]
         return artifacts.hash_json([artifacts.hash_arrays(*(recorded[name] for name in sorted(recorded))), settings])
+
+    def start(self, episode: int) -> dict[str, Doubles]:
+        """Read the state of x_0."""
+        return {name: values[0] for name, values in self.read_states(episode).items()}
 
     def read(self, episode: int) -> Iterator[Sequence[Frame]]:
         """Render each state."""
@@ -103,6 +106,11 @@ class States:
         return entry
 
 
+def versions() -> list[str]:
+    """Return the versions of the packages that make environments and draw them."""
+    return [importlib.metadata.version(name) for name in ("mujoco", "gymnasium", "gymnasium-robotics")]
+
+
 def _rows(group: h5py.Group, path: str, n_states: int) -> Doubles:
     if not isinstance(group.get(path), h5py.Dataset):
         raise BadInput(f"{group.name} has no {path!r}, which its frames are rendered from; record it, or give --frames")
@@ -112,7 +120,7 @@ def _rows(group: h5py.Group, path: str, n_states: int) -> Doubles:
 
 
 def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, cameras: Sequence[str], what: str) -> States:
-    """Find the simulator states that a Minari dataset records.
+    """Find the simulator states that a Minari dataset records, and the cameras that look at them.
 
     Args:
         file: its HDF5 file.
@@ -122,8 +130,21 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
         what: names the dataset in an error.
 
     Raises:
-        BadInput: no state, several, or one that does not fit the model; no such camera; a model that is no file.
+        BadInput: as `recorded_states`, or there is no such camera.
         ZestError: the environment cannot be made here.
+    """
+    checked = check_env(env_spec, what)
+    stage = stage_of(checked, tuple(cameras))
+    states = recorded_states(file, episodes, checked, stage.simulation, what)
+    states = replace(states, cameras=tuple(cameras))
+    return states if cameras or stage.is_fixed else replace(states, pose=stage.default_pose(states.start(0)))
+
+
+def check_env(env_spec: str | None, what: str) -> str:
+    """Return the EnvSpec (JSON) of a dataset if its environment may be made.
+
+    Raises:
+        BadInput: there is none, it would run code that is not trusted, or it names a model that is no file.
     """
     if env_spec is None:
         raise BadInput(
@@ -131,12 +152,31 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
             "states could be rendered; give --frames FOLDER with a video of each episode"
         )
     spec = json.loads(env_spec)
-    plugin = state_plugins.registered(str(spec.get("id")))
-    if plugin is None:
+    if state_plugins.registered(str(spec.get("id"))) is None:
         code = without_wrappers(env_spec)
         check_env_spec(code, f"the env_spec of {what}", "give --frames FOLDER with a video of each episode")
     check_model_files(spec)
-    row = recorded_env(str(spec["entry_point"]))
+    return env_spec
+
+
+def recorded_states(
+    file: Path, episodes: Sequence[str], env_spec: str, simulation: Simulation, what: str, *, marks: bool = True
+) -> States:
+    """Find the simulator states that a Minari dataset records.
+
+    Args:
+        file: its HDF5 file.
+        episodes: the groups in it.
+        env_spec: of its environment, as JSON, checked.
+        simulation: that environment.
+        what: names the dataset in an error.
+        marks: whether frames show marks of goals, so that these must be recorded, too.
+
+    Raises:
+        BadInput: no state, several, or one that does not fit the model.
+    """
+    spec, row, env = json.loads(env_spec), simulation.recorded, simulation.env
+    plugin = state_plugins.registered(str(spec.get("id")))
     with open_hdf5(file) as opened:
         group = opened[episodes[0]]
         infos = entries(group["infos"], "infos") if "infos" in group else {}
@@ -148,23 +188,22 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
         raise BadInput(f"{what} records several states ({', '.join(recorded)}); remove all but one")
     else:
         columns = ((recorded[0], 0, None),) if recorded else _observed_qpos(row, spec, what)
-    stage = stage_of(env_spec, tuple(cameras))
     folder = columns[0][0].rpartition("/")[0] if columns else "infos/state"
-    scenery = tuple(path.format(folder=folder) for path in stage.scenery)
+    scenery = [path.format(folder=folder) for path in row.scenery(env)] if marks or row.moves_bodies else []
+    fields = [path for name in (*MODEL_FIELDS, *DATA_FIELDS[1:]) if (path := f"{folder}/{name}") in paths]
     missing = [path for path in (*scenery, *(path for path, *_ in columns)) if path not in paths]
-    if missing:
+    if missing and any(path.endswith(MODEL_FIELDS) for path in fields):
+        scenery = []  # they hold the same
+    elif missing:
         raise BadInput(
             f"{what} lacks {', '.join(missing)}, without which frames of {spec.get('id')} would be wrong. Record it, "
             "or give --frames FOLDER with a video of each episode"
         )
     noisy = not recorded and any((spec.get("kwargs") or {}).get(name, 1) for name in row.noise)
-    states = States(file, tuple(episodes), env_spec, columns, scenery, tuple(cameras), noisy=noisy)
-    start = {name: values[0] for name, values in states.read_states(0).items()}
-    if len(start["qpos"]) != stage.model.nq:
-        raise BadInput(
-            f"{what}: qpos must have {stage.model.nq} columns for {spec.get('id')}, got {len(start['qpos'])}"
-        )
-    return states if cameras or stage.is_fixed else replace(states, pose=stage.default_pose(start))
+    states = States(file, tuple(episodes), env_spec, columns, (*scenery, *fields), noisy=noisy)
+    if (width := len(states.start(0)["qpos"])) != simulation.model.nq:
+        raise BadInput(f"{what}: qpos must have {simulation.model.nq} columns for {spec.get('id')}, got {width}")
+    return states
 
 
 def _observed_qpos(row: RecordedEnv, spec: Mapping[str, Any], what: str) -> Columns:

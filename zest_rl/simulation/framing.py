@@ -1,0 +1,98 @@
+"""Where to look from: a ring of views round an object, from the side on which the robot works, sized by the object."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.simulation.bodies import Bodies, subtree
+from zest_rl.simulation.rendering import Camera
+from zest_rl.simulation.views import ring
+
+HIDDEN_GROUP = 5
+"""Of geoms that are not drawn; MuJoCo's default draws the groups 0 to 2."""
+Point = tuple[float, float, float]
+_DRAWN_GROUPS = 3
+_SPREAD = 30.0  # degrees to either side
+_ELEVATIONS = (-15.0, -20.0, -30.0)  # degrees
+_DISTANCES = (2.0, 1.5, 2.8)  # in units of the object's radius, in the proportions of the kitchen's 1, 0.7 and 1.4 m
+_SEEN = 0.5  # of the part that the best view sees; a view that sees less shows the scene rather than the object
+
+
+@dataclass(frozen=True)
+class ObjectRing:
+    """Views round an object, without those from which it is hidden."""
+
+    azimuth: float
+    """In degrees, of the view from behind the robot; 90 looks along +y."""
+    radius: float
+    """Of the object with the way that it goes, in metres."""
+    n_views: int
+    kept: tuple[int, ...]
+    """Indices of the views that are drawn."""
+
+    def cameras(self, lookat: Point) -> tuple[Camera, ...]:
+        """Return the cameras that look at a point."""
+        views = ring(
+            lookat,
+            self.n_views,
+            azimuths=(self.azimuth - _SPREAD, self.azimuth + _SPREAD),
+            distances=[self.radius * share for share in _DISTANCES],
+            elevations=_ELEVATIONS,
+        )
+        return tuple(views[view] for view in self.kept)
+
+
+def drawn_geoms(model: mujoco.MjModel, bodies: Bodies) -> NDArray[np.intp]:
+    """Return the geoms of some bodies that are drawn, or all of them if none is."""
+    geoms = np.flatnonzero(bodies[model.geom_bodyid])
+    shown = geoms[(model.geom_group[geoms] < _DRAWN_GROUPS) & (model.geom_rgba[geoms, 3] > 0)]
+    return shown if len(shown) else geoms
+
+
+def object_geoms(model: mujoco.MjModel, body: int) -> NDArray[np.intp]:
+    """Return the drawn geoms of a body and of everything below it."""
+    return drawn_geoms(model, subtree(model, [body]))
+
+
+def centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Point:
+    """Return the middle of an object as it stands in `data`, in metres."""
+    geoms = object_geoms(model, body)
+    if len(geoms) == 0:
+        x, y, z = data.xpos[body].tolist()
+        return x, y, z
+    at, around = data.geom_xpos[geoms], model.geom_rbound[geoms, None]
+    x, y, z = ((at - around).min(axis=0) + (at + around).max(axis=0)).tolist()
+    return x / 2, y / 2, z / 2
+
+
+def radius(model: mujoco.MjModel, data: mujoco.MjData, body: int, lookat: Point) -> float:
+    """Return how far from a point the farthest part of an object is, in metres."""
+    geoms = object_geoms(model, body)
+    far = np.linalg.norm(data.geom_xpos[geoms] - lookat, axis=1) + model.geom_rbound[geoms]
+    return float(max(far.tolist(), default=0.0))
+
+
+def robot_side(model: mujoco.MjModel, data: mujoco.MjData, robot: Bodies, lookat: Point) -> NDArray[np.float64]:
+    """Return the horizontal way (2,) from a robot's centre of mass to a point, in metres."""
+    mass = model.body_mass[robot]
+    if mass.sum() == 0:
+        return np.zeros(2)
+    return np.asarray(lookat[:2] - (mass @ data.xipos[robot, :2]) / mass.sum())
+
+
+def azimuth_of(ways: Sequence[NDArray[np.float64]]) -> float:
+    """Return the azimuth in degrees of the mean of some horizontal ways; 90 if there is none."""
+    x, y = np.mean(ways, axis=0).tolist()
+    return math.degrees(math.atan2(y, x)) if math.hypot(x, y) > 1e-6 else 90.0
+
+
+def views_that_see(shares: NDArray[np.float64]) -> tuple[int, ...]:
+    """Choose views by how much of the object they see: (V,) shares in [0, 1] → indices, all if none sees it."""
+    return tuple(np.flatnonzero(shares >= _SEEN * shares.max()).tolist())
