@@ -213,7 +213,7 @@ def test_episodes_of_one_length_can_be_shuffled(maze: list[Episode], goal: Path,
             ["--frames", "cameras/wrist"],
             "has no pictures at 'cameras/wrist', and there is no such folder; entries with pictures: observations/cam",
         ),
-        (["--frames", "cameras/top", "--views", "3"], "--views belong to the kitchen's own renderer"),
+        (["--frames", "cameras/top", "--views", "3"], "--views belong to the ring of views round an object"),
     ],
 )
 def test_bad_input_names_what_is_wrong_and_writes_nothing(

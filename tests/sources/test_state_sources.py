@@ -77,7 +77,7 @@ def rendered(env_id: str, camera: str | None, episode: Episode, seed: int) -> li
 )
 def test_without_a_camera_frames_are_those_that_the_environment_renders(env_id: str) -> None:
     (episode,) = roll_out(env_id, (3,))
-    source = open_source(write_states("some/random-v0", env_id, [episode]))
+    source = open_source(write_states("some/random-v0", env_id, [episode]), cameras=["default"])
     ours = [views[0] for views in source.frames.read(0)]
     np.testing.assert_array_equal(ours, rendered(env_id, None, episode, seed=0))
     assert max(np.std(frame) for frame in ours) > 10, "it shows something"
@@ -85,15 +85,16 @@ def test_without_a_camera_frames_are_those_that_the_environment_renders(env_id: 
 
 def test_a_process_that_has_made_no_environment_yet_renders_one(maze: list[Episode]) -> None:
     dataset = write_states("maze/random-v0", "PointMaze_UMaze-v3", maze[:1])
-    code = "from zest_rl.sources import open_source; frames = open_source(f).frames; print(len(list(frames.read(0))))"
-    done = subprocess.run([sys.executable, "-c", f"f = {dataset!r}; {code}"], capture_output=True, text=True)
+    code = "from zest_rl.sources import open_source; print(len(list(open_source(f, cameras=c).frames.read(0))))"
+    given = f"f, c = {dataset!r}, ['default']"
+    done = subprocess.run([sys.executable, "-c", f"{given}; {code}"], capture_output=True, text=True)
     assert done.stdout == f"{LENGTHS[0] + 1}\n", done.stderr
 
 
 def test_the_environments_own_camera_stays_where_it_stood_at_first_and_embeddings_depend_on_it() -> None:
     episodes = roll_out("HalfCheetah-v5", (2, 2))
-    both = open_source(write_states("cheetah/both-v0", "HalfCheetah-v5", episodes)).frames
-    last = open_source(write_states("cheetah/last-v0", "HalfCheetah-v5", episodes[1:])).frames
+    both = open_source(write_states("cheetah/both-v0", "HalfCheetah-v5", episodes), cameras=["default"]).frames
+    last = open_source(write_states("cheetah/last-v0", "HalfCheetah-v5", episodes[1:]), cameras=["default"]).frames
     assert both.describe()["camera_pose"][1] == 4.0, "metres, of the environment's default_camera_config"
     assert both.describe()["camera_pose"] != last.describe()["camera_pose"]
     assert both.digest(1) != last.digest(0), "the same states, seen from elsewhere"
@@ -122,7 +123,7 @@ def test_states_are_rendered_as_the_environment_itself_shows_them_with_the_door_
     assert (code, "has no camera 'fixd'; did you mean 'fixed'?" in error) == (2, True)
     with h5py.File(reader.dataset_path(dataset) / reader.DATA_FILE, "r+") as file:
         del file["episode_0/infos/state/door_body_pos"]
-    code, error = refusal("relabel", dataset, "--goal", goal)
+    code, error = refusal("relabel", dataset, "--goal", goal, "--camera", "default")
     assert (code, "lacks infos/state/door_body_pos" in error) == (2, True)
 
 
@@ -131,12 +132,12 @@ def test_the_target_of_fetch_is_where_the_goal_is_and_its_joints_must_be_recorde
 ) -> None:
     fetch = roll_out("FetchReach-v4", (2,))
     dataset = write_states("fetch/random-v0", "FetchReach-v4", fetch)
-    frames = [views[0] for views in open_source(dataset).frames.read(0)]
+    frames = [views[0] for views in open_source(dataset, cameras=["default"]).frames.read(0)]
     red = np.stack(frames).astype(int)
     assert ((red[..., 0] > 150) & (red[..., 1] < 60) & (red[..., 2] < 60)).any(axis=(1, 2)).all(), "the target is red"
-    assert zest("relabel", dataset, "--goal", goal, "--n-workers", "1")["n_still_frames"] == 0
+    assert zest("relabel", dataset, "--goal", goal, "--camera", "default", "--n-workers", "1")["n_still_frames"] == 0
     blind = write_states("fetch/blind-v0", "FetchReach-v4", fetch, with_state=False)
-    code, error = refusal("relabel", blind, "--goal", goal)
+    code, error = refusal("relabel", blind, "--goal", goal, "--camera", "default")
     assert code == 2
     assert "observations of FetchReach-v4 do not hold it to the bit. Record infos/state/qpos, or give --frames" in error
 
@@ -172,7 +173,7 @@ def test_the_kitchens_noisy_positions_are_shown_and_told(goal: Path, capsys: pyt
     assert 0 < np.abs(frames.read_states(0)["qpos"] - qpos).max() <= 0.001
     assert frames.describe()["qpos_is_noisy"]
     assert len(list(frames.read(0))) == len(qpos)
-    assert cli.main(["relabel", "some/random-v0", "--goal", str(goal), "--n-workers", "1"]) == 0
+    assert cli.main(["relabel", "some/random-v0", "--goal", str(goal), "--camera", "default", "--n-workers", "1"]) == 0
     err = capsys.readouterr().err
     warning = "warning: states are read from observations that the environment blurred"
     assert 0 <= err.find(warning) < err.index("embedding frames: 100/100"), "told before the work"
@@ -201,7 +202,7 @@ def observed_alone(env_id: str, **kwargs: Any) -> tuple[Any, np.ndarray]:
     episode = Episode(observations, [], state, np.array(actions), np.zeros(3))
     kept = {name: np.array([info[name] for info in infos]) for name in infos[0] if name in ("x_position", "y_position")}
     dataset = write_rollouts("some/random-v0", [episode], as_observed, env=env.spec, infos=lambda _: kept)
-    return open_source(dataset).frames, np.array([one["qpos"] for one in state])
+    return open_source(dataset, cameras=["default"]).frames, np.array([one["qpos"] for one in state])
 
 
 @pytest.mark.parametrize(
@@ -212,7 +213,7 @@ def test_code_that_is_not_the_registered_environments_is_not_run(
 ) -> None:
     dataset = write_states("maze/random-v0", "PointMaze_UMaze-v3", maze[:1])
     edit_spec(dataset, entry_point=trap)
-    code, error = refusal("relabel", dataset, "--goal", goal)
+    code, error = refusal("relabel", dataset, "--goal", goal, "--camera", "default")
     assert (code, f"would run code of {trap!r}" in error) == (2, True)
 
 
@@ -240,7 +241,7 @@ def test_pictures_of_any_environment_are_taken_for_it_is_never_built(
     assert zest("export", made, "--output", tmp_path / "maze.npz")["n_transitions"] == sum(LENGTHS)
     states = write_states("maze/random-v0", "PointMaze_UMaze-v3", maze)
     edit_spec(states, id="Robot-v0", entry_point=entry_point)
-    code, error = refusal("relabel", states, "--goal", goal)
+    code, error = refusal("relabel", states, "--goal", goal, "--camera", "default")
     assert (code, f"would run code of {entry_point!r}; only gymnasium.*" in error) == (2, True)
     assert "are trusted; give --frames FOLDER" in error
 
@@ -250,7 +251,7 @@ def test_an_env_spec_that_is_none_is_refused(
 ) -> None:
     dataset = write_states("maze/random-v0", "PointMaze_UMaze-v3", maze[:1])
     edit_spec(dataset, unheard_of=1)
-    code, error = refusal("relabel", dataset, "--goal", goal)
+    code, error = refusal("relabel", dataset, "--goal", goal, "--camera", "default")
     assert (code, "env_spec is not the JSON of a Gymnasium EnvSpec" in error) == (2, True)
 
 
@@ -261,22 +262,22 @@ def test_wrapped_observations_are_not_taken_for_the_state_and_wrappers_are_not_r
     for with_state in (False, True):
         dataset = write_states(f"maze/state-{with_state}-v0", "PointMaze_UMaze-v3", maze[:1], with_state=with_state)
         edit_spec(dataset, additional_wrappers=[wrapper])
-    code, error = refusal("relabel", "maze/state-False-v0", "--goal", goal)
+    code, error = refusal("relabel", "maze/state-False-v0", "--goal", goal, "--camera", "default")
     assert (code, "wrappers (Trap) may have changed the observations of PointMaze_UMaze-v3" in error) == (2, True)
-    assert len(list(open_source("maze/state-True-v0").frames.read(0))) == LENGTHS[0] + 1
+    assert len(list(open_source("maze/state-True-v0", cameras=["default"]).frames.read(0))) == LENGTHS[0] + 1
 
 
 def test_wrappers_of_other_packages_are_left_out_where_the_state_is_recorded(maze: list[Episode]) -> None:
     dataset = write_states("maze/wrapped-v0", "PointMaze_UMaze-v3", maze[:1], with_state=True)
     edit_spec(dataset, additional_wrappers=[{"name": "Theirs", "entry_point": "their_package:Wrapper", "kwargs": {}}])
-    assert len(list(open_source(dataset).frames.read(0))) == LENGTHS[0] + 1
+    assert len(list(open_source(dataset, cameras=["default"]).frames.read(0))) == LENGTHS[0] + 1
     edit_spec(dataset, additional_wrappers=None)
-    assert len(list(open_source(dataset).frames.read(0))) == LENGTHS[0] + 1
+    assert len(list(open_source(dataset, cameras=["default"]).frames.read(0))) == LENGTHS[0] + 1
 
 
 def test_targets_that_only_a_renderer_places_are_refused(goal: Path, refusal: Callable[..., tuple[int, str]]) -> None:
     dataset = write_states("hand/random-v0", "HandReach-v3", roll_out("HandReach-v3", (1,)))
-    code, error = refusal("relabel", dataset, "--goal", goal)
+    code, error = refusal("relabel", dataset, "--goal", goal, "--camera", "default")
     assert (code, "places targets only while it renders" in error) == (2, True)
 
 
@@ -291,7 +292,7 @@ def test_embeddings_of_states_are_cached_by_the_compiled_model(maze: list[Episod
         path.write_text(text.replace('rgba="0.8 0.6 .4 1"', f'rgba="{colour}"'))
         stage_of.cache_clear()
         with pytest.warns(Notice, match=r"is made from .*cheetah\.xml"):
-            digests.append(open_source(dataset).frames.digest(0))
+            digests.append(open_source(dataset, cameras=["default"]).frames.digest(0))
     assert digests[0] == digests[2] != digests[1]
 
 
@@ -342,7 +343,7 @@ def test_another_package_rebuilds_the_states_of_its_own_environment(
     register("own_robot:qpos")
     made = zest(*words)["dataset"]
     assert read(made, lambda ds: ds.metadata)["zest"]["relabel"]["frames"]["qpos_from"] == "own_robot:qpos"
-    frames: Any = open_source(dataset).frames
+    frames: Any = open_source(dataset, cameras=["default"]).frames
     for i, episode in enumerate(episodes):
         np.testing.assert_allclose(frames.read_states(i)["qpos"], [state["qpos"] for state in episode.state], atol=1e-6)
     for function, message in (

@@ -24,7 +24,7 @@ from zest_rl.runtime.arrays import Layout, read_arrays, write_arrays
 from zest_rl.runtime.cache import cache_folder
 from zest_rl.runtime.parallel import Engine, cached_jobs, one_thread, run_jobs
 from zest_rl.sources.base import EpisodeFrames, Source
-from zest_rl.types import FloatArray
+from zest_rl.types import FloatArray, Frame
 
 STEPS_PER_BATCH = 16
 CHECKED_STEPS = 16
@@ -51,19 +51,29 @@ class _Job:
 def _embed_episode(shared: _Shared, job: _Job) -> dict[str, NDArray[Any]]:
     embedder = shared.embedder.load()
     steps = islice(shared.frames.read(job.episode), job.n_steps + 2)  # one more than allowed, to notice too many
-    parts = []
+    index, parts = list[int](), []
+
+    def changed() -> Iterator[Sequence[Frame]]:
+        last = None
+        for views in steps:
+            index.append(index[-1] + (views is not last) if index else 0)
+            if views is not last:
+                yield views
+            last = views
+
+    changes = changed()
     with one_thread():
-        while batch := list(islice(steps, STEPS_PER_BATCH)):
+        while batch := list(islice(changes, STEPS_PER_BATCH)):
             vectors = embedder.embed_images([frame for views in batch for frame in views])
             parts.append(vectors.reshape(len(batch), -1, embedder.dim))
-    n_frames = sum(map(len, parts))
+    n_frames = len(index)
     if n_frames not in (job.n_steps, job.n_steps + 1):
         number = f"more than {job.n_steps + 1}" if n_frames > job.n_steps else str(n_frames)
         raise BadInput(
             f"episode {job.episode} has {job.n_steps} actions, so it needs {job.n_steps + 1} frames (x_0 … x_T), or "
             f"{job.n_steps} without the last; got {number}. Are these the frames of this episode, one for each step?"
         )
-    return {"embeddings": np.concatenate(parts)}
+    return {"embeddings": np.concatenate(parts)[index]}
 
 
 def _embed_frame(shared: _Shared, place: tuple[int, int]) -> FloatArray:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
 import mujoco
@@ -22,7 +22,8 @@ _DRAWN_GROUPS = 3
 _SPREAD = 30.0  # degrees to either side
 _ELEVATIONS = (-15.0, -20.0, -30.0)  # degrees
 _DISTANCES = (2.0, 1.5, 2.8)  # in units of the object's radius, in the proportions of the kitchen's 1, 0.7 and 1.4 m
-_SEEN = 0.5  # of the part that the best view sees; a view that sees less shows the scene rather than the object
+_SEEN = 0.5  # of the object; a view that sees less shows the scene rather than the object
+_LIFTS = (0.0, 15.0, 30.0, 45.0)  # degrees by which a ring is lifted until half of its views see the object
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,10 @@ class ObjectRing:
     radius: float
     """Of the object with the way that it goes, in metres."""
     n_views: int
-    kept: tuple[int, ...]
-    """Indices of the views that are drawn."""
+    lift: float = 0.0
+    """Degrees by which the cameras look down more steeply."""
+    dropped: tuple[int, ...] = ()
+    """Indices of the views that are not drawn."""
 
     def cameras(self, lookat: Point) -> tuple[Camera, ...]:
         """Return the cameras that look at a point."""
@@ -44,9 +47,23 @@ class ObjectRing:
             self.n_views,
             azimuths=(self.azimuth - _SPREAD, self.azimuth + _SPREAD),
             distances=[self.radius * share for share in _DISTANCES],
-            elevations=_ELEVATIONS,
+            elevations=[elevation - self.lift for elevation in _ELEVATIONS],
         )
-        return tuple(views[view] for view in self.kept)
+        return tuple(view for index, view in enumerate(views) if index not in self.dropped)
+
+    def that_sees(self, seen_shares: Callable[[ObjectRing], NDArray[np.float64]]) -> ObjectRing:
+        """Return the ring without the views from which the scene hides the object, lifted where these are the most.
+
+        Args:
+            seen_shares: ring → (V,) the share of the object that each view sees, in [0, 1].
+        """
+        lifted = [replace(self, lift=lift) for lift in _LIFTS]
+        shares = list[NDArray[np.float64]]()
+        while len(shares) < len(lifted) and not (shares and (shares[-1] >= _SEEN).mean() >= 0.5):
+            shares.append(seen_shares(lifted[len(shares)]))
+        best = int(np.argmax([share.mean() for share in shares]))
+        hidden = shares[best] < _SEEN * shares[best].max()
+        return replace(lifted[best], dropped=tuple(np.flatnonzero(hidden).tolist()))
 
 
 def drawn_geoms(model: mujoco.MjModel, bodies: Bodies) -> NDArray[np.intp]:
@@ -91,8 +108,3 @@ def azimuth_of(ways: Sequence[NDArray[np.float64]]) -> float:
     """Return the azimuth in degrees of the mean of some horizontal ways; 90 if there is none."""
     x, y = np.mean(ways, axis=0).tolist()
     return math.degrees(math.atan2(y, x)) if math.hypot(x, y) > 1e-6 else 90.0
-
-
-def views_that_see(shares: NDArray[np.float64]) -> tuple[int, ...]:
-    """Choose views by how much of the object they see: (V,) shares in [0, 1] → indices, all if none sees it."""
-    return tuple(np.flatnonzero(shares >= _SEEN * shares.max()).tolist())

@@ -69,9 +69,9 @@ class Canvas:
         """Leave the background black; a model's sky may hold random specks."""
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = False
 
-    def hide_marks(self) -> None:
-        """Leave out sites and tendons, which mark goals and drive robots."""
-        self._option.sitegroup[:] = self._option.tendongroup[:] = 0
+    def hide_tendons(self) -> None:
+        """Leave out tendons, which drive robots."""
+        self._option.tendongroup[:] = 0
 
     def segments(self, data: mujoco.MjData) -> NDArray[np.int32]:
         """Return which geom each pixel shows, (V, H, W) int32; −1 for what is no geom."""

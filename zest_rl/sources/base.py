@@ -26,7 +26,7 @@ class EpisodeFrames(Protocol):
     def read(self, episode: int) -> Iterator[Sequence[Frame]]:
         """Yield the V frames of x_0, x_1, …, each (H, W, 3) uint8 RGB, with few in memory.
 
-        T + 1 steps, or T: then x_T repeats x_{T-1}.
+        T + 1 steps, or T: then x_T repeats x_{T-1}. A step that is the same object as the one before has equal frames.
         """
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,6 @@ from zest_rl.simulation.framing import (
     object_geoms,
     radius,
     robot_side,
-    views_that_see,
 )
 from zest_rl.simulation.rendering import Camera
 from zest_rl.simulation.scene import SceneConfig
@@ -54,14 +53,16 @@ _EXTENT = 0.9  # quantile over episodes: what one throws off the table does not 
 
 
 class SceneStage:
-    """A simulation in which some bodies are hidden, drawn without sites, tendons, shadows and sky."""
+    """A simulation in which some bodies are hidden, drawn without marks, shadows and sky."""
 
     def __init__(self, simulation: Simulation, hidden: Bodies) -> None:
         """Open a GL context; see `scene_stage`."""
         self.simulation, model = simulation, simulation.model
-        self._shown = np.where(hidden[model.geom_bodyid], HIDDEN_GROUP, model.geom_group)
+        groups, marks = simulation.groups, robot_bodies(model) & ~hidden  # marks on a robot in view are part of it
+        self._geoms = np.where(hidden[model.geom_bodyid], HIDDEN_GROUP, groups.geoms)
+        self._sites = np.where(marks[model.site_bodyid], groups.sites, HIDDEN_GROUP)
         self._canvas = simulation.open_canvas(())
-        self._canvas.hide_marks()
+        self._canvas.hide_tendons()
 
     def lookat(self, state: State, body: int) -> Point:
         """Return the middle of a body as it stands in a state, in metres."""
@@ -74,17 +75,21 @@ class SceneStage:
         return list(self._canvas.draw(self.simulation.data))
 
     def seen_shares(self, state: State, cameras: Sequence[Camera], body: int) -> NDArray[np.float64]:
-        """Return which share of a body each camera sees, of what it would see of the body alone: (V,) in [0, 1]."""
+        """Return which share of a body each camera sees, of what it would see of the body alone: (V,) in [0, 1].
+
+        1 where the body is out of sight for other reasons.
+        """
         self._place(state, cameras)
         model, geoms = self.simulation.model, object_geoms(self.simulation.model, body)
         in_scene = np.isin(self._canvas.segments(self.simulation.data), geoms).sum(axis=(1, 2))
         model.geom_group[np.setdiff1d(np.arange(model.ngeom), geoms)] = HIDDEN_GROUP
         alone = np.isin(self._canvas.segments(self.simulation.data), geoms).sum(axis=(1, 2))
-        return np.asarray(in_scene / np.maximum(alone, 1))
+        return np.where(alone > 0, in_scene / np.maximum(alone, 1), 1.0)
 
     def _place(self, state: State, cameras: Sequence[Camera]) -> None:
         self.simulation.put(state)
-        self.simulation.model.geom_group[:] = self._shown
+        model = self.simulation.model
+        model.geom_group[:], model.site_group[:] = self._geoms, self._sites
         self._canvas.cameras = tuple(camera.to_mujoco() for camera in cameras)
 
 
@@ -206,13 +211,14 @@ def find_scene(
     body = _looked_at(model, config, robot, travel.mean(axis=0))
     joints = np.isin(model.jnt_bodyid, np.flatnonzero(subtree(model, [body])))
     liveliest = chosen[int(travel[:, joints].max(axis=1, initial=0).argmax())]
-    ring = _ring(simulation, robot, samples, body, config.n_views)
     stage = scene_stage(checked, hidden)
-    shares = [
-        stage.seen_shares(sample[0], ring.cameras(stage.lookat(sample[0], body)), body)
-        for sample in (samples[i] for i in _spread(len(samples), _STARTS))
-    ]
-    ring = replace(ring, kept=views_that_see(np.mean(shares, axis=0)))
+    starts = [samples[i][0] for i in _spread(len(samples), _STARTS)]
+
+    def seen_shares(ring: ObjectRing) -> NDArray[np.float64]:
+        shares = [stage.seen_shares(start, ring.cameras(stage.lookat(start, body)), body) for start in starts]
+        return np.asarray(np.mean(shares, axis=0))
+
+    ring = _ring(simulation, robot, samples, body, config.n_views).that_sees(seen_shares)
     return SceneStates(states, hidden, body, ring, config.tolerance, liveliest)
 
 
@@ -262,4 +268,4 @@ def _ring(
             simulation.put(state)
             farthest = max(farthest, radius(model, data, body, lookat))
         radii.append(farthest)
-    return ObjectRing(azimuth_of(ways), float(np.quantile(radii, _EXTENT)), n_views, tuple(range(n_views)))
+    return ObjectRing(azimuth_of(ways), float(np.quantile(radii, _EXTENT)), n_views)

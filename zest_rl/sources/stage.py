@@ -9,6 +9,7 @@ from __future__ import annotations
 import atexit
 import functools
 from contextlib import redirect_stderr
+from dataclasses import dataclass
 from io import StringIO
 from typing import Any
 
@@ -16,6 +17,7 @@ import zest_rl.runtime.load_order  # isort: skip
 import gymnasium
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 import zest_rl.kitchen.env  # noqa: F401  # registers its environment, and those of gymnasium-robotics
 from zest_rl.data.env_specs import check_registered, without_wrappers
@@ -32,6 +34,16 @@ Pose = tuple[tuple[float, float, float], float, float, float]
 """Point that a camera looks at and distance from it in metres, azimuth and elevation in degrees."""
 
 
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """To which of MuJoCo's groups the parts of a model belong, of which it draws 0 to 2."""
+
+    geoms: NDArray[np.int32]
+    """(ngeom,)."""
+    sites: NDArray[np.int32]
+    """(nsite,)."""
+
+
 class Simulation:
     """An environment in which recorded states are restored."""
 
@@ -41,6 +53,8 @@ class Simulation:
         compiled = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
         mujoco.mj_saveModel(self.model, None, compiled)
         self.model_sha256 = artifacts.hash_arrays(compiled)
+        self.groups = Groups(self.model.geom_group.copy(), self.model.site_group.copy())
+        """As the environment made them."""
         self.entry_point, self.recorded = entry_point, recorded_env(entry_point)
 
     def put(self, state: State) -> None:

@@ -25,9 +25,12 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     from zest_rl.sources import KitchenStates
 
     def tell(source: Source) -> None:
+        facts = source.frames.describe()
+        if facts["kind"] == "scene":
+            ui.say(f"looking at {facts['look_at']}, hidden: {', '.join(facts['robot']) or 'nothing'}")
         if not isinstance(source.frames, KitchenStates):
             ui.say(f"frames: {', '.join(source.frames.views)}")
-        if source.frames.describe().get("qpos_is_noisy"):
+        if facts.get("qpos_is_noisy"):
             ui.warn("states are read from observations that the environment blurred: what is shown trembles a little")
 
     started = time.monotonic()

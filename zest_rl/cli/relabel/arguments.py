@@ -21,7 +21,12 @@ class Config:
     """Where the frames are: entries with pictures (observations/KEY), or folders with episode_0.mp4, … or episode_0/
     with pictures; several are views that are averaged. Default: the only pictures there are, else recorded states."""
     camera: tuple[str, ...] = ()
-    """Cameras of the environment's model, to render recorded states from, averaged as views. Default: its own."""
+    """Cameras of the environment's model, to render recorded states from with the robot in view, averaged as views; or
+    "default", that of env.render(). Without: a ring of views round what is moved, and the robot hidden."""
+    robot: tuple[str, ...] = ()
+    """Bodies of the model that are hidden, with all below them. Default: what is driven."""
+    look_at: str | None = None
+    """Body of the model in the middle of the views. Default: the undriven one that moves most."""
     goal: str = "same-scene"
     """Folder with init/ and goal/ pictures, or "text:closed microwave -> open microwave"; and for the kitchen
     "same-scene", "toys" (toy scenes of the task), "text" (the task's own sentences), or "drawings" (a wrong goal)."""
