@@ -10,6 +10,7 @@ from zest_rl.cli.config import COMMON_FLAGS
 VERBS = {
     "doctor": "check versions, rendering, weights and disk; say how to fix each",
     "collect": "an expert with noise → a Minari dataset",
+    "goal": "an episode or a video → goal pictures: its first and last frame, as the scorer sees them",
     "relabel": "a dataset and a goal (pictures or sentences) → a dataset with ZeST rewards",
     "inspect": "a relabeled dataset → what its rewards are worth, before anything is trained on them",
     "select": "datasets and a goal → does the goal find its frames (`goals`), `actions`, real `footage`?",

@@ -176,6 +176,65 @@ def write_dataset(
     return dataset_path(dataset_id)
 
 
+def _build_episodes(
+    root: Path, dataset_id: str, episodes: Sequence[Mapping[str, Any]], env_spec: str | None, fields: Mapping[str, Any]
+) -> None:
+    os.environ["MINARI_DATASETS_PATH"] = str(root)  # of this child process only
+    import gymnasium
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    spec = None if env_spec is None else gymnasium.envs.registration.EnvSpec.from_json(env_spec)
+    buffers = [EpisodeBuffer(id=i, **episode) for i, episode in enumerate(episodes)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Minari warns of every optional field that is not given
+        minari.create_dataset_from_buffers(dataset_id, buffers, env=spec, jpeg_encoding=False, **fields)
+
+
+def _flat(values: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
+    """Return the arrays of nested dictionaries by their paths."""
+    if not isinstance(values, Mapping):
+        return {prefix: values}
+    return {path: a for name, part in values.items() for path, a in _flat(part, f"{prefix}/{name}".lstrip("/")).items()}
+
+
+def write_episodes(
+    dataset_id: str,
+    episodes: Sequence[Mapping[str, Any]],
+    *,
+    observation_space: Any,
+    action_space: Any,
+    env_spec: str | None,
+    description: str,
+) -> Path:
+    """Write episodes of any environment as a new Minari dataset.
+
+    Args:
+        dataset_id: ``namespace/name-vN``; must not exist.
+        episodes: of each the arguments of a Minari EpisodeBuffer, as arrays; see `zest_rl.types` for their lengths.
+        observation_space: of the environment.
+        action_space: of the environment.
+        env_spec: Gymnasium EnvSpec as JSON; None where it cannot be stored.
+        description: one paragraph for readers.
+
+    Returns:
+        The dataset's folder.
+
+    Raises:
+        BadInput: bad id, or a dataset of this id exists.
+        ZestError: the disk is full or read-only; nothing is left behind.
+    """
+    fields = {"observation_space": observation_space, "action_space": action_space, "description": description}
+    arrays = [_flat({name: part for name, part in episode.items() if name != "seed"}) for episode in episodes]
+    n_bytes = sum(array.nbytes for of_episode in arrays for array in of_episode.values())
+    with _staged(dataset_id, 2 * n_bytes) as staging:
+        write_in_child("the dataset", _build_episodes, staging / "root", dataset_id, episodes, env_spec, fields)
+        (staging / "root" / dataset_id / "data").rename(staging / "data")
+        shutil.rmtree(staging / "root")
+        _seal(staging, dataset_id, arrays)
+    return dataset_path(dataset_id)
+
+
 class Trajectories(Protocol):
     """Episodes that can be written with new rewards."""
 

@@ -18,8 +18,8 @@ from zest_rl.embedders import DEFAULT_EMBEDDER, Precision
 from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.views import Views
 from zest_rl.rewards.embeddings import EpisodeEmbeddings
+from zest_rl.rewards.episode_goals import read_source_goal
 from zest_rl.rewards.frame_embeddings import FrameEmbeddings
-from zest_rl.rewards.goals import read_free_goal
 from zest_rl.rewards.scorer import SCORER_FILE, Scorer, ScorerConfig
 from zest_rl.rewards.scores import Features, Similarity
 from zest_rl.rewards.state_embeddings import StateEmbeddings
@@ -228,11 +228,11 @@ def _open(
     """Build the scorer, and open the embeddings: of distinct states where frames are rendered from them."""
     frames = source.frames
     options: dict[str, Any] = {"device": device, "n_workers": n_workers, "engine": engine}
+    ring = frames.ring if isinstance(frames, KitchenStates) else None
+    scorer = Scorer.build(config, read_source_goal(config.goal, source), views=ring, device=device)
     if not isinstance(frames, KitchenStates):
-        scorer = Scorer.build(config, read_free_goal(config.goal), device=device)
         return scorer, FrameEmbeddings(source, config.embedder, config.precision, **options)
-    kitchen = StateScorer.build(config, frames.ring, frames.states[0][0], **options)
-    return kitchen.scorer, StateEmbeddings(kitchen.embedder, frames.states)
+    return scorer, StateEmbeddings(StateScorer.of(scorer, **options).embedder, frames.states)
 
 
 def _write_scorer(folder: Path, scorer: Scorer) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from zest_rl.data.writer import Trajectories
 from zest_rl.types import Frame
@@ -28,6 +28,14 @@ class EpisodeFrames(Protocol):
 
         T + 1 steps, or T: then x_T repeats x_{T-1}. A step that is the same object as the one before has equal frames.
         """
+
+
+@runtime_checkable
+class RenderedFrames(Protocol):
+    """`EpisodeFrames` of which the last of an episode can be had without those before."""
+
+    def ends(self, episode: int) -> tuple[Sequence[Frame], Sequence[Frame]]:
+        """Return the V frames of x_0, and those of x_T."""
 
 
 @dataclass(frozen=True)

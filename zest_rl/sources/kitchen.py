@@ -45,6 +45,13 @@ class KitchenStates:
         for state in canonical_states(self.states[episode], self.ring):
             yield list(renderer.render(state))
 
+    def ends(self, episode: int) -> tuple[Sequence[Frame], Sequence[Frame]]:
+        """Render x_0 and x_T."""
+        first, last = map(
+            self.ring.shared_renderer().render, canonical_states(self.states[episode][[0, -1]], self.ring)
+        )
+        return list(first), list(last)
+
 
 def kitchen_source(dataset_id: str, ring: Views) -> Source:
     """Open a dataset of the kitchen, seen from a ring of views; raises as `Dataset.states`."""

@@ -14,14 +14,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.simulation.recorder import DATA_FIELDS, MODEL_FIELDS
+
 Doubles = NDArray[np.float64]
 Columns = tuple[tuple[str, int, int | None], ...]
 """Paths within an episode and the columns that make up qpos, in order: from the first number up to, but without, the
 second; None: to the end."""
-MODEL_FIELDS = ("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "geom_rgba", "mat_rgba")
-"""Of a model, what an environment may change at its reset, so that frames depend on it."""
-DATA_FIELDS = ("qpos", "mocap_pos", "mocap_quat")
-"""Of the simulator's data, what frames depend on."""
 State = Mapping[str, Doubles]
 """``qpos`` (nq,), and everything else in the scene by the last part of its path."""
 

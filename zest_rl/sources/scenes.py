@@ -136,7 +136,8 @@ class SceneStates:
         facts = self.states.describe()
         del facts["camera_pose"]
         scene = {"robot": roots, "look_at": body_name(model, self.body), "ring": asdict(self.ring)}
-        return {**facts, "kind": "scene", "views": list(self.views), **scene, "tolerance": self.tolerance}
+        found = {"tolerance": self.tolerance, "liveliest": self.liveliest}
+        return {**facts, "kind": "scene", "views": list(self.views), **scene, **found}
 
     def digest(self, episode: int) -> str:
         """Hash the states as they are rendered, the environment with its versions and its model, and the views."""
@@ -147,14 +148,23 @@ class SceneStates:
 
     def read(self, episode: int) -> Iterator[Sequence[Frame]]:
         """Render each state that differs from the one before; the frames of one that does not are the same object."""
-        recorded, stage = self._canonical(episode), self._stage
-        rows = [{name: values[step] for name, values in recorded.items()} for step in range(len(recorded["qpos"]))]
-        cameras = self.ring.cameras(stage.lookat(rows[0], self.body))
+        rows, cameras = self._placed(episode)
         frames = list[Frame]()
         for before, row in zip([{}, *rows], rows, strict=False):
             if not before or any((row[name] != before[name]).any() for name in row):
-                frames = stage.render(row, cameras)
+                frames = self._stage.render(row, cameras)
             yield frames
+
+    def ends(self, episode: int) -> tuple[Sequence[Frame], Sequence[Frame]]:
+        """Render x_0 and x_T."""
+        rows, cameras = self._placed(episode)
+        return self._stage.render(rows[0], cameras), self._stage.render(rows[-1], cameras)
+
+    def _placed(self, episode: int) -> tuple[Sequence[State], tuple[Camera, ...]]:
+        """Return the states of an episode, and the cameras that look at where the body stands in the first."""
+        recorded = self._canonical(episode)
+        rows = [{name: values[step] for name, values in recorded.items()} for step in range(len(recorded["qpos"]))]
+        return rows, self.ring.cameras(self._stage.lookat(rows[0], self.body))
 
     def _canonical(self, episode: int) -> dict[str, Doubles]:
         """Read states with qpos on the grid, and the robot at rest."""

@@ -23,8 +23,9 @@ from zest_rl.data.hdf5 import check_rows, open_hdf5, read_array
 from zest_rl.data.observations import entries
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
+from zest_rl.simulation.recorder import DATA_FIELDS, MODEL_FIELDS
 from zest_rl.sources import state_plugins
-from zest_rl.sources.recorded_envs import DATA_FIELDS, MODEL_FIELDS, Columns, Doubles, RecordedEnv
+from zest_rl.sources.recorded_envs import Columns, Doubles, RecordedEnv
 from zest_rl.sources.stage import SIZE, Pose, Simulation, stage_of
 from zest_rl.types import Frame, check_finite
 

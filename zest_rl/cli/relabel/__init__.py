@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from zest_rl.cli.relabel.arguments import Config
@@ -33,9 +35,12 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         if facts.get("qpos_is_noisy"):
             ui.warn("states are read from observations that the environment blurred: what is shown trembles a little")
 
+    options = {name: value for name, value in vars(config).items() if name != "preview"}
+    if config.preview is not None:
+        return _preview(config.preview, options)
     started = time.monotonic()
     with progress_in_parts(ui, "embedding frames") as on_progress:
-        relabeled = relabel(**vars(config), on_start=tell, on_progress=on_progress)
+        relabeled = relabel(**options, on_start=tell, on_progress=on_progress)
     if relabeled.already_there:
         ui.say(f"{relabeled.dataset_id} is there already, nothing to do")
     with open_dataset(relabeled.dataset_id) as ds:
@@ -55,6 +60,16 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "seconds": round(time.monotonic() - started, 2),
         "next": command,
     }
+
+
+def _preview(path: Path, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Draw one picture instead of relabeling."""
+    from zest_rl.rewards.preview import preview
+
+    of_source = ("dataset", "goal", "frames", "camera", "robot", "look_at", "views", "show_robot", "tolerance")
+    chosen = {name: options[name] for name in (*of_source, "skip_incomplete")}
+    episode = preview(path, **chosen)
+    return {"preview": str(path), "episode": episode, "next": "the same command without --preview"}
 
 
 def _next_command(ds: Dataset) -> str:

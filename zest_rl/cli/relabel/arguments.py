@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
@@ -28,8 +29,11 @@ class Config:
     look_at: str | None = None
     """Body of the model in the middle of the views. Default: the undriven one that moves most."""
     goal: str = "same-scene"
-    """Folder with init/ and goal/ pictures, or "text:closed microwave -> open microwave"; and for the kitchen
-    "same-scene", "toys" (toy scenes of the task), "text" (the task's own sentences), or "drawings" (a wrong goal)."""
+    """Folder with init/ and goal/ pictures, "text:closed microwave -> open microwave", or "episode:3", its ends; for
+    the kitchen also "same-scene", "toys" (toy scenes of the task), "text" (the task's own sentences), or "drawings" (a
+    wrong goal)."""
+    preview: Path | None = None
+    """Write one picture of what the scorer will see, FILE.png, and stop: all views of an episode's ends, the goal."""
     embedder: str = "efficientnet-lite0"
     """Frozen network: efficientnet-lite0, open_clip:MODEL/PRETRAINED, torchvision:resnet50, timm:NAME, …@/path,
     transformers:/folder, or a family that another package registers."""

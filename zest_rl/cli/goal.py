@@ -1,0 +1,42 @@
+"""``zest goal``: an episode or a video → goal pictures, seen as the scorer sees them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from zest_rl.cli.ui import Ui
+
+
+@dataclass(frozen=True)
+class Config:
+    """Write the first and the last frame of an episode as a folder for `zest relabel --goal`."""
+
+    dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
+    """As for `zest relabel`; or a video."""
+    episode: int = 0
+    """Its number, from 0."""
+    output: Path = Path("goal")
+    """Folder that gets init/ and goal/."""
+    frames: tuple[str, ...] = ()
+    """As for `zest relabel`, like the following ones."""
+    camera: tuple[str, ...] = ()
+    """Cameras of the environment's model, or default."""
+    robot: tuple[str, ...] = ()
+    """Bodies of the model that are hidden."""
+    look_at: str | None = None
+    """Body of the model in the middle of the views."""
+    show_robot: bool = False
+    """Keep the robot in view."""
+
+
+def run(config: Config, ui: Ui) -> dict[str, Any]:
+    """Render or read, and write."""
+    from zest_rl.rewards.episode_goals import write_goal
+
+    chosen = {name: getattr(config, name) for name in ("frames", "robot", "look_at", "show_robot")}
+    folder, goal = write_goal(config.dataset, config.episode, config.output, cameras=config.camera, **chosen)
+    return {"goal": str(folder), "n_views": len(goal.goals), "next": f"zest relabel DATASET --goal {folder}"}

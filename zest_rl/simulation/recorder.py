@@ -1,0 +1,148 @@
+"""A Gymnasium wrapper that records what frames can be rendered from later, and writes a Minari dataset.
+
+The state of the simulator is recorded rather than pictures: a scene may then be looked at from anywhere, without the
+robot. What an environment changes of its model is recorded, too, such as where it puts a door.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, SupportsFloat
+
+import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
+import gymnasium
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from zest_rl.data.writer import write_episodes
+from zest_rl.errors import BadInput
+
+MODEL_FIELDS = ("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "geom_rgba", "mat_rgba")
+"""Of a model, what an environment may change at its reset, so that frames depend on it."""
+DATA_FIELDS = ("qpos", "mocap_pos", "mocap_quat")
+"""Of the simulator's data, what frames depend on."""
+_SUCCESS = ("success", "is_success")
+
+
+class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Records the episodes of a MuJoCo environment. Wrap before the first reset; an episode ends at the next reset.
+
+    Alignment: `zest_rl.types`. ``infos/state`` gets qpos, qvel, the mocap bodies, and of the model what differs from
+    when it was wrapped; ``infos/success`` what the environment calls success or is_success.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        """Wrap an environment.
+
+        Raises:
+            BadInput: it has no MuJoCo model.
+        """
+        super().__init__(env)
+        self._bare: Any = env.unwrapped
+        if not isinstance(getattr(self._bare, "model", None), mujoco.MjModel):
+            raise BadInput(
+                f"a recorder needs an environment with a MuJoCo model (env.unwrapped.model), got {self._bare}; record "
+                "its pictures instead, and give them with --frames"
+            )
+        self._compiled = {name: getattr(self._bare.model, name).copy() for name in MODEL_FIELDS}
+        self._episodes = list[_Episode]()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode; one without steps is dropped."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._episodes = [*self.recorded, _Episode(seed)]
+        self._add(observation, info)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Act and record."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        episode = self._episodes[-1]
+        episode.actions.append(np.array(action))
+        episode.rewards.append(float(reward))
+        episode.terminated = bool(terminated)
+        self._add(observation, info)
+        return observation, reward, terminated, truncated, info
+
+    def _add(self, observation: Any, info: dict[str, Any]) -> None:
+        model, data, episode = self._bare.model, self._bare.data, self._episodes[-1]
+        state = {name: getattr(data, name).ravel().copy() for name in ("qvel", *DATA_FIELDS)}
+        for name, compiled in self._compiled.items():
+            if not np.array_equal(now := getattr(model, name), compiled):
+                state[name] = now.ravel().copy()
+        episode.observations.append(_copied(observation))
+        episode.states.append(state)
+        succeeded = next((info[name] for name in _SUCCESS if name in info), None)
+        episode.successes.append(None if succeeded is None else bool(succeeded))
+
+    @property
+    def recorded(self) -> list[_Episode]:
+        """The episodes with at least one step."""
+        return [episode for episode in self._episodes if episode.actions]
+
+    def write(self, dataset_id: str, description: str = "") -> Path:
+        """Write all episodes as a new Minari dataset, and return its folder.
+
+        Raises:
+            BadInput: nothing was recorded, the id is not ``namespace/name-vN``, or a dataset of this id exists.
+            ZestError: the disk is full or read-only; nothing is left behind.
+        """
+        episodes = self.recorded
+        if not episodes:
+            raise BadInput("a dataset must have at least 1 episode with a step, got none; act in the environment first")
+        names = sorted({name for episode in episodes for state in episode.states for name in state})
+        rest = {name: values.ravel() for name, values in self._compiled.items()}
+        return write_episodes(
+            dataset_id,
+            [episode.arrays(names, rest) for episode in episodes],
+            observation_space=self.env.observation_space,
+            action_space=self.env.action_space,
+            env_spec=_storable(self.env.spec),
+            description=description or f"Recorded in {self.env.spec.id if self.env.spec else self._bare}.",
+        )
+
+
+class _Episode:
+    """What was recorded of an episode so far."""
+
+    def __init__(self, seed: int | None) -> None:
+        self.seed, self.terminated = seed, False
+        self.observations, self.actions, self.rewards = list[Any](), list[NDArray[Any]](), list[float]()
+        self.states, self.successes = list[dict[str, NDArray[np.float64]]](), list[bool | None]()
+
+    def arrays(self, names: list[str], rest: dict[str, NDArray[np.float64]]) -> dict[str, Any]:
+        """Return the arguments of a Minari EpisodeBuffer; a state without one of `names` has that of `rest`."""
+        state = {name: np.stack([s[name] if name in s else rest[name] for s in self.states]) for name in names}
+        infos: dict[str, Any] = {"state": {name: values for name, values in state.items() if values.size}}
+        if any(success is not None for success in self.successes):
+            infos["success"] = np.array([bool(success) for success in self.successes])
+        last = np.arange(len(self.actions)) == len(self.actions) - 1
+        return {
+            "observations": _stacked(self.observations),
+            "actions": np.stack(self.actions),
+            "rewards": np.array(self.rewards, np.float32),
+            "terminations": last & self.terminated,
+            "truncations": last & (not self.terminated),
+            "infos": infos,
+        } | ({} if self.seed is None else {"seed": self.seed})
+
+
+def _copied(observation: Any) -> Any:
+    if isinstance(observation, dict):
+        return {name: _copied(part) for name, part in observation.items()}
+    return np.array(observation)
+
+
+def _stacked(rows: list[Any]) -> Any:
+    if isinstance(rows[0], dict):
+        return {name: _stacked([row[name] for row in rows]) for name in rows[0]}
+    return np.stack(rows)
+
+
+def _storable(spec: gymnasium.envs.registration.EnvSpec | None) -> str | None:
+    """Return a spec as JSON; None where it has functions that no file can name."""
+    try:
+        return None if spec is None or callable(spec.entry_point) else spec.to_json()
+    except (TypeError, ValueError):
+        return None
