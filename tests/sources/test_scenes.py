@@ -13,7 +13,7 @@ import pytest
 from read_dataset import read
 from rollouts import Episode, Run, as_observed, recorded_state, roll_out, state_of, write_rollouts, write_states
 
-from zest_rl.errors import BadInput
+from zest_rl.errors import BadInput, ZestError
 from zest_rl.sources import open_source
 from zest_rl.sources.scenes import SceneStates
 
@@ -167,3 +167,18 @@ def test_a_robot_without_an_object_can_be_looked_at_itself() -> None:
 def test_flags_of_scenes_are_refused_where_there_is_none(pictured: str) -> None:
     with pytest.raises(BadInput, match="--robot and --look-at belong to the ring of views round an object"):
         open_source(pictured, frames=["observations/cameras/top"], robot=["a"], look_at="b")
+
+
+def test_an_environment_that_the_dataset_cannot_name_is_made_by_a_function_that_the_user_names(
+    pushed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code = 'import gymnasium\nimport gymnasium_robotics\n\ndef push():\n    return gymnasium.make("FetchPush-v4")\n'
+    (tmp_path / "makes_push.py").write_text(code, encoding="utf-8")
+    scene = scene_of(pushed, env="makes_push:push", n_views=1)
+    assert (scene.describe()["look_at"], scene.describe()["env_id"]) == ("object0", "makes_push:push")
+    np.testing.assert_array_equal(next(iter(scene.read(1))), next(iter(scene_of(pushed, n_views=1).read(1))))
+    with pytest.raises(ZestError, match=r"makes_push:pull cannot be made here \(AttributeError"):
+        open_source(pushed, env="makes_push:pull")
+    with pytest.raises(BadInput, match=r"--env must be package\.module:make"):
+        open_source(pushed, env="FetchPush-v4")

@@ -25,6 +25,8 @@ class Config:
     """As for `zest relabel`, like the following ones."""
     camera: tuple[str, ...] = ()
     """Cameras of the environment's model, or default."""
+    env: str | None = None
+    """package.module:make, a function that makes the environment."""
     robot: tuple[str, ...] = ()
     """Bodies of the model that are hidden."""
     look_at: str | None = None
@@ -37,6 +39,6 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Render or read, and write."""
     from zest_rl.rewards.episode_goals import write_goal
 
-    chosen = {name: getattr(config, name) for name in ("frames", "robot", "look_at", "show_robot")}
+    chosen = {name: getattr(config, name) for name in ("frames", "env", "robot", "look_at", "show_robot")}
     folder, goal = write_goal(config.dataset, config.episode, config.output, cameras=config.camera, **chosen)
     return {"goal": str(folder), "n_views": len(goal.goals), "next": f"zest relabel DATASET --goal {folder}"}

@@ -7,6 +7,7 @@ package registers the same code under this id).
 from __future__ import annotations
 
 import json
+import re
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +19,8 @@ from zest_rl.runtime.files import check_file, user_path
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
 
+MAKER = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+"""``package.module:make``, a function that makes an environment; only the user may name one, never the data."""
 TRUSTED_ENTRY_POINTS = ("gymnasium.", "gymnasium_robotics.", "zest_rl.")
 
 

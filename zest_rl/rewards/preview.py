@@ -21,11 +21,15 @@ CELL, GAP, TITLE = 160, 4, 16
 MAX_ROWS = 8
 
 
-def preview(
-    path: Path, dataset: str, goal: str, *, camera: Sequence[str] = (), views: int = Views.n_views, **frames: Any
-) -> int:
+FRAME_OPTIONS = ("frames", "env", "robot", "look_at", "show_robot", "tolerance", "skip_incomplete")
+"""Arguments of `zest_rl.rewards.relabel.relabel` that `open_source` takes by the same names."""
+
+
+def preview(path: Path, dataset: str, goal: str, **options: Any) -> int:
     """Draw what `zest_rl.rewards.relabel.relabel` would see with the same arguments; returns as `write_preview`."""
-    source = open_source(dataset, cameras=camera, n_views=views, **frames)
+    frames = {name: options[name] for name in FRAME_OPTIONS if name in options}
+    cameras, n_views = options.get("camera", ()), options.get("views", Views.n_views)
+    source = open_source(dataset, cameras=cameras, n_views=n_views, **frames)
     return write_preview(path, source, read_source_goal(goal, source))
 
 

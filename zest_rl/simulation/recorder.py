@@ -39,13 +39,14 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
             BadInput: it has no MuJoCo model.
         """
         super().__init__(env)
-        self._bare: Any = env.unwrapped
-        if not isinstance(getattr(self._bare, "model", None), mujoco.MjModel):
+        bare: Any = env.unwrapped
+        self._bare = bare
+        if not isinstance(getattr(bare, "model", None), mujoco.MjModel):
             raise BadInput(
                 f"a recorder needs an environment with a MuJoCo model (env.unwrapped.model), got {self._bare}; record "
                 "its pictures instead, and give them with --frames"
             )
-        self._compiled = {name: getattr(self._bare.model, name).copy() for name in MODEL_FIELDS}
+        self._compiled = {name: getattr(bare.model, name).copy() for name in MODEL_FIELDS}
         self._episodes = list[_Episode]()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

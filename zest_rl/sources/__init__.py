@@ -18,6 +18,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from zest_rl.data import reader
+from zest_rl.data.env_specs import MAKER
 from zest_rl.data.observations import choose_pictures, joined, rejected
 from zest_rl.data.writer import DatasetCopy, Trajectories
 from zest_rl.errors import BadInput
@@ -50,6 +51,7 @@ def open_source(
     *,
     frames: Sequence[str] = (),
     cameras: Sequence[str] = (),
+    env: str | None = None,
     robot: Sequence[str] = (),
     look_at: str | None = None,
     n_views: int = Views.n_views,
@@ -65,6 +67,7 @@ def open_source(
             recorded states.
         cameras: of the environment's model, one per view, to render the recorded states from, with the robot in view;
             or ``default``, the environment's own. Empty: a ring of views round what is moved.
+        env: ``package.module:make``, a function that makes the environment of recorded states; None: the dataset's.
         robot: scenes only: bodies that are hidden; empty: what is driven.
         look_at: scenes only: body in the middle of the views; None: the one that moves most.
         n_views: scenes and kitchen only: cameras around the object.
@@ -76,6 +79,8 @@ def open_source(
         BadInput: no such dataset, or its frames are missing or ambiguous; the message lists the candidates.
     """
     with nullcontext() if _is_path(dataset) else reader.open_dataset(dataset) as ds:
+        if env is not None and MAKER.fullmatch(env) is None:
+            raise BadInput(f"--env must be package.module:make, a function that makes an environment, got {env!r}")
         of_scenes = {"--robot": bool(robot), "--look-at": look_at is not None}
         rendering = {
             **of_scenes,
@@ -106,7 +111,7 @@ def open_source(
             )
         else:
             scene = SceneConfig(tuple(robot), look_at, show_robot, n_views, tolerance)
-            episode_frames = None if folders else _minari_frames(ds, keys, cameras, scene)
+            episode_frames = None if folders else _minari_frames(ds, keys, cameras, env, scene)
             trajectories = DatasetCopy.of(ds)
     if folders:
         episode_frames = find_videos(folders, len(trajectories.n_steps), dataset)
@@ -137,16 +142,18 @@ def _refuse(flags: Mapping[str, bool], why: str) -> None:
 
 
 def _minari_frames(
-    ds: reader.Dataset, keys: Sequence[str], cameras: Sequence[str], scene: SceneConfig
+    ds: reader.Dataset, keys: Sequence[str], cameras: Sequence[str], env: str | None, scene: SceneConfig
 ) -> EpisodeFrames:
     names = list(ds.groups)
     pictures = picture_entries(ds.file, f"{names[0]}/observations")
-    rendered = cameras or scene != SceneConfig() or not (keys or any(form.channels for form in pictures.values()))
+    rendered = (
+        cameras or env or scene != SceneConfig() or not (keys or any(form.channels for form in pictures.values()))
+    )
     if rendered:
         from zest_rl.sources.scenes import find_scene
         from zest_rl.sources.states import find_states
 
-        what, env_spec = f"dataset {ds.id}", ds.record.env_spec
+        what, env_spec = f"dataset {ds.id}", ds.record.env_spec if env is None else env
         try:
             if cameras:
                 return find_states(ds.file, names, env_spec, () if tuple(cameras) == OWN_CAMERA else cameras, what)

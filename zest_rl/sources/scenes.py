@@ -7,7 +7,6 @@ from names that the user gives.
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -43,7 +42,7 @@ from zest_rl.simulation.rendering import Camera
 from zest_rl.simulation.scene import SceneConfig
 from zest_rl.simulation.views import on_grid
 from zest_rl.sources.recorded_envs import Doubles, State
-from zest_rl.sources.stage import SIZE, Simulation, make_simulation
+from zest_rl.sources.stage import SIZE, Simulation, env_facts, make_simulation
 from zest_rl.sources.states import States, check_env, recorded_states, versions
 from zest_rl.types import Frame
 
@@ -210,7 +209,7 @@ def find_scene(
     robot = subtree(model, bodies_named(model, config.robot, "--robot")) if config.robot else robot_bodies(model)
     if not (robot.any() or config.show_robot):
         raise BadInput(
-            f"the robot is found by what drives it, but {json.loads(checked).get('id')} has no actuated joint, and no "
+            f"the robot is found by what drives it, but {env_facts(checked)['id']} has no actuated joint, and no "
             "body that is welded to a mocap body; name the robot's bodies with --robot BODY …, or hide nothing "
             "(--show-robot)"
         )

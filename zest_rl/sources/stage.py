@@ -8,9 +8,14 @@ from __future__ import annotations
 
 import atexit
 import functools
+import importlib
+import json
+import sys
+from collections.abc import Callable
 from contextlib import redirect_stderr
 from dataclasses import dataclass
 from io import StringIO
+from pathlib import Path
 from typing import Any
 
 import zest_rl.runtime.load_order  # isort: skip
@@ -20,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import zest_rl.kitchen.env  # noqa: F401  # registers its environment, and those of gymnasium-robotics
-from zest_rl.data.env_specs import check_registered, without_wrappers
+from zest_rl.data.env_specs import MAKER, check_registered, without_wrappers
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime import artifacts
 from zest_rl.simulation.rendering import Canvas
@@ -129,13 +134,26 @@ def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
     return Stage(make_simulation(env_spec), cameras)
 
 
+def env_facts(env_spec: str) -> dict[str, Any]:
+    """Return an EnvSpec (JSON) as a dictionary; of ``package.module:make`` it has that as id and entry point."""
+    facts: dict[str, Any] = (
+        {"id": env_spec, "entry_point": env_spec} if MAKER.fullmatch(env_spec) else json.loads(env_spec)
+    )
+    return facts
+
+
 def make_simulation(env_spec: str) -> Simulation:
     """Make the environment of a dataset.
 
+    Args:
+        env_spec: an EnvSpec as JSON; or ``package.module:make``, a function without arguments that the user names.
+
     Raises:
-        BadInput: not an EnvSpec, not a registered environment, or one without a MuJoCo model.
+        BadInput: neither, not a registered environment, or one without a MuJoCo model.
         ZestError: the environment cannot be made with the packages here.
     """
+    if MAKER.fullmatch(env_spec):
+        return Simulation(_bare(functools.partial(_call, env_spec), env_spec), env_spec)
     try:
         spec = gymnasium.envs.registration.EnvSpec.from_json(without_wrappers(env_spec))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -148,17 +166,31 @@ def make_simulation(env_spec: str) -> Simulation:
         "install the version of its package that it was recorded with, or give --frames FOLDER with a video of each "
         "episode",
     )
+    env = _bare(functools.partial(gymnasium.make, spec, disable_env_checker=True), spec.id)
+    return Simulation(env, str(spec.entry_point))
+
+
+def _call(maker: str) -> Any:
+    """Import a function of the working directory or an installed package, and call it."""
+    module, _, name = maker.partition(":")
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.insert(0, here)
+    return getattr(importlib.import_module(module), name)()
+
+
+def _bare(make: Callable[[], Any], name: str) -> Any:
+    """Make an environment, and return it without its wrappers."""
     try:
         with redirect_stderr(StringIO()):  # on import gymnasium_robotics prints news of its other environments
-            env: Any = gymnasium.make(spec, disable_env_checker=True).unwrapped
+            env: Any = make().unwrapped
     except Exception as error:  # whatever an environment raises
         raise ZestError(
-            f"{spec.id} cannot be made here ({type(error).__name__}: {error}); install what it needs, or give --frames "
+            f"{name} cannot be made here ({type(error).__name__}: {error}); install what it needs, or give --frames "
             "FOLDER with a video of each episode"
         ) from error
     if not isinstance(getattr(env, "model", None), mujoco.MjModel):
-        raise BadInput(f"{spec.id} has no MuJoCo model to render; give --frames FOLDER with a video of each episode")
-    return Simulation(env, str(spec.entry_point))
+        raise BadInput(f"{name} has no MuJoCo model to render; give --frames FOLDER with a video of each episode")
+    return env
 
 
 def _renderer_of(env: Any) -> Any:

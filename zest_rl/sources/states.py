@@ -18,7 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from zest_rl.data.env_specs import check_env_spec, check_model_files, without_wrappers
+from zest_rl.data.env_specs import MAKER, check_env_spec, check_model_files, without_wrappers
 from zest_rl.data.hdf5 import check_rows, open_hdf5, read_array
 from zest_rl.data.observations import entries
 from zest_rl.errors import BadInput, ZestError
@@ -26,7 +26,7 @@ from zest_rl.runtime import artifacts
 from zest_rl.simulation.recorder import DATA_FIELDS, MODEL_FIELDS
 from zest_rl.sources import state_plugins
 from zest_rl.sources.recorded_envs import Columns, Doubles, RecordedEnv
-from zest_rl.sources.stage import SIZE, Pose, Simulation, stage_of
+from zest_rl.sources.stage import SIZE, Pose, Simulation, env_facts, stage_of
 from zest_rl.types import Frame, check_finite
 
 _VERSION = 2  # raise it when a pixel changes, here or in stage.py: cached embeddings depend on it
@@ -68,7 +68,7 @@ class States:
             "scenery_from": list(self.scenery),
             "camera_pose": self.pose,
             "size": SIZE,
-            "env_id": json.loads(self.env_spec).get("id"),
+            "env_id": env_facts(self.env_spec).get("id"),
         }
 
     def digest(self, episode: int) -> str:
@@ -101,7 +101,7 @@ class States:
 
     @property
     def _plugin(self) -> EntryPoint:
-        entry = state_plugins.registered(json.loads(self.env_spec)["id"])
+        entry = state_plugins.registered(env_facts(self.env_spec)["id"])
         if entry is None:
             raise ZestError("the package that rebuilds the states is not installed on this machine; install it")
         return entry
@@ -142,7 +142,7 @@ def find_states(file: Path, episodes: Sequence[str], env_spec: str | None, camer
 
 
 def check_env(env_spec: str | None, what: str) -> str:
-    """Return the EnvSpec (JSON) of a dataset if its environment may be made.
+    """Return the EnvSpec (JSON) of a dataset, or what the user named instead, if its environment may be made.
 
     Raises:
         BadInput: there is none, it would run code that is not trusted, or it names a model that is no file.
@@ -150,8 +150,11 @@ def check_env(env_spec: str | None, what: str) -> str:
     if env_spec is None:
         raise BadInput(
             f"{what} shows no frames: there are no pictures to choose, and it names no environment whose recorded "
-            "states could be rendered; give --frames FOLDER with a video of each episode"
+            "states could be rendered; give --env package.module:make, a function that makes it, or --frames FOLDER "
+            "with a video of each episode"
         )
+    if MAKER.fullmatch(env_spec):
+        return env_spec
     spec = json.loads(env_spec)
     if state_plugins.registered(str(spec.get("id"))) is None:
         code = without_wrappers(env_spec)
@@ -176,7 +179,7 @@ def recorded_states(
     Raises:
         BadInput: no state, several, or one that does not fit the model.
     """
-    spec, row, env = json.loads(env_spec), simulation.recorded, simulation.env
+    spec, row, env = env_facts(env_spec), simulation.recorded, simulation.env
     plugin = state_plugins.registered(str(spec.get("id")))
     with open_hdf5(file) as opened:
         group = opened[episodes[0]]

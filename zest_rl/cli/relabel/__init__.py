@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from zest_rl.cli.relabel.arguments import Config
@@ -23,6 +21,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     import numpy as np
 
     from zest_rl.data.reader import open_dataset
+    from zest_rl.rewards.preview import preview
     from zest_rl.rewards.relabel import relabel
     from zest_rl.sources import KitchenStates
 
@@ -37,7 +36,8 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
     options = {name: value for name, value in vars(config).items() if name != "preview"}
     if config.preview is not None:
-        return _preview(config.preview, options)
+        shown = preview(config.preview, **options)
+        return {"preview": str(config.preview), "episode": shown, "next": "the same command without --preview"}
     started = time.monotonic()
     with progress_in_parts(ui, "embedding frames") as on_progress:
         relabeled = relabel(**options, on_start=tell, on_progress=on_progress)
@@ -60,16 +60,6 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "seconds": round(time.monotonic() - started, 2),
         "next": command,
     }
-
-
-def _preview(path: Path, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Draw one picture instead of relabeling."""
-    from zest_rl.rewards.preview import preview
-
-    of_source = ("dataset", "goal", "frames", "camera", "robot", "look_at", "views", "show_robot", "tolerance")
-    chosen = {name: options[name] for name in (*of_source, "skip_incomplete")}
-    episode = preview(path, **chosen)
-    return {"preview": str(path), "episode": episode, "next": "the same command without --preview"}
 
 
 def _next_command(ds: Dataset) -> str:

@@ -24,6 +24,8 @@ class Config:
     camera: tuple[str, ...] = ()
     """Cameras of the environment's model, to render recorded states from with the robot in view, averaged as views; or
     "default", that of env.render(). Without: a ring of views round what is moved, and the robot hidden."""
+    env: str | None = None
+    """package.module:make, a function that makes the environment of recorded states. Default: the dataset names it."""
     robot: tuple[str, ...] = ()
     """Bodies of the model that are hidden, with all below them. Default: what is driven."""
     look_at: str | None = None
