@@ -110,10 +110,21 @@ def test_a_view_sees_a_share_of_the_object(pushed: str) -> None:
     np.testing.assert_allclose(stage.seen_shares(start, cameras, scene.body), 1, atol=0.02)
     model = stage.simulation.model
     (block,), (table,) = (model.body(name).geomadr for name in ("object0", "table0"))
-    higher = 2.4 * model.geom_size[block, 2]  # lower than the cameras
-    model.geom_size[table, 2] += higher  # the table swallows the block
-    assert (stage.seen_shares(start, cameras, scene.body) == 0).all()
-    model.geom_size[table, 2] -= higher
+    sizes = model.geom_size.copy()
+    sizes[table, 2] += 2.4 * sizes[block, 2]  # lower than the cameras
+    swallowed = {**start, "geom_size": sizes.ravel()}
+    assert (stage.seen_shares(swallowed, cameras, scene.body) == 0).all()
+    np.testing.assert_allclose(stage.seen_shares(start, cameras, scene.body), 1, atol=0.02)
+
+
+def test_what_a_state_lacks_is_as_the_environment_made_it_whatever_was_shown_before(pushed: str) -> None:
+    scene = scene_of(pushed, n_views=1)
+    data = scene._stage.simulation.data
+    made = data.mocap_pos.copy()
+    scene._stage.lookat({**scene.states.start(0), "mocap_pos": made + 1}, scene.body)
+    assert (data.mocap_pos != made).all()
+    assert scene_of(pushed, n_views=1) == scene, "the side from which the robot works, too"
+    np.testing.assert_array_equal(data.mocap_pos, made)
 
 
 def test_rewards_come_from_the_scene_and_the_metadata_say_what_was_seen(goal: Path, zest: Run, pushed: str) -> None:

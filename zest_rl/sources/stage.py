@@ -28,6 +28,7 @@ import zest_rl.kitchen.env  # noqa: F401  # registers its environment, and those
 from zest_rl.data.env_specs import MAKER, check_registered, without_wrappers
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime import artifacts
+from zest_rl.simulation.recorder import DATA_FIELDS, MODEL_FIELDS
 from zest_rl.simulation.rendering import Canvas
 from zest_rl.sources import state_plugins
 from zest_rl.sources.recorded_envs import State, recorded_env
@@ -60,10 +61,17 @@ class Simulation:
         self.model_sha256 = artifacts.hash_arrays(compiled)
         self.groups = Groups(self.model.geom_group.copy(), self.model.site_group.copy())
         """As the environment made them."""
+        self._made = [
+            (getattr(owner, name), getattr(owner, name).copy())
+            for owner, names in ((self.model, MODEL_FIELDS), (self.data, DATA_FIELDS))
+            for name in names
+        ]
         self.entry_point, self.recorded = entry_point, recorded_env(entry_point)
 
     def put(self, state: State) -> None:
-        """Restore a recorded state, and compute positions in the world."""
+        """Restore a recorded state, and compute positions in the world; what it lacks is as the environment made it."""
+        for values, made in self._made:
+            values[...] = made
         self.recorded.put_state(self.env, state)
         mujoco.mj_fwdPosition(self.model, self.data)
 
