@@ -206,6 +206,8 @@ def write_episodes(
     action_space: Any,
     env_spec: str | None,
     description: str,
+    ref_min_score: float | None = None,
+    ref_max_score: float | None = None,
 ) -> Path:
     """Write episodes of any environment as a new Minari dataset.
 
@@ -216,6 +218,8 @@ def write_episodes(
         action_space: of the environment.
         env_spec: Gymnasium EnvSpec as JSON; None where it cannot be stored.
         description: one paragraph for readers.
+        ref_min_score: return that counts as 0 %.
+        ref_max_score: return that counts as 100 %.
 
     Returns:
         The dataset's folder.
@@ -225,12 +229,15 @@ def write_episodes(
         ZestError: the disk is full or read-only; nothing is left behind.
     """
     fields = {"observation_space": observation_space, "action_space": action_space, "description": description}
+    references = {"ref_min_score": ref_min_score, "ref_max_score": ref_max_score}
+    given = {name: score for name, score in references.items() if score is not None}
     arrays = [_flat({name: part for name, part in episode.items() if name != "seed"}) for episode in episodes]
     n_bytes = sum(array.nbytes for of_episode in arrays for array in of_episode.values())
     with _staged(dataset_id, 2 * n_bytes) as staging:
         write_in_child("the dataset", _build_episodes, staging / "root", dataset_id, episodes, env_spec, fields)
         (staging / "root" / dataset_id / "data").rename(staging / "data")
         shutil.rmtree(staging / "root")
+        _set_metadata(staging / METADATA_FILE, **given)  # Minari keeps them beside an eval_env alone
         _seal(staging, dataset_id, arrays)
     return dataset_path(dataset_id)
 

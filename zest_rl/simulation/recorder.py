@@ -82,8 +82,17 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         """The episodes with at least one step."""
         return [episode for episode in self._episodes if episode.actions]
 
-    def write(self, dataset_id: str, description: str = "") -> Path:
+    def write(
+        self, dataset_id: str, description: str = "", *, ref_min_score: float | None = None,
+        ref_max_score: float | None = None,
+    ) -> Path:
         """Write all episodes as a new Minari dataset, and return its folder.
+
+        Args:
+            dataset_id: ``namespace/name-vN``.
+            description: one paragraph for readers.
+            ref_min_score: return that counts as 0 %, such as that of doing nothing.
+            ref_max_score: return that counts as 100 %, such as an expert's; give both or none.
 
         Raises:
             BadInput: nothing was recorded, the id is not ``namespace/name-vN``, or a dataset of this id exists.
@@ -101,6 +110,8 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
             action_space=self.env.action_space,
             env_spec=_storable(self.env.spec),
             description=description or f"Recorded in {self.env.spec.id if self.env.spec else self._bare}.",
+            ref_min_score=ref_min_score,
+            ref_max_score=ref_max_score,
         )
 
 
