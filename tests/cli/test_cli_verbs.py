@@ -204,7 +204,7 @@ def test_a_recipe_of_a_table_is_valid_and_found_from_anywhere(
     comparison = read_comparison(Path("eval") / path.name)
     assert comparison.tables.title
     assert comparison.methods.keys() == comparison.tables.methods.keys()
-    assert comparison.collect
+    assert comparison.tasks
 
 
 @pytest.mark.parametrize(

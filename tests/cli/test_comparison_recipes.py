@@ -17,7 +17,7 @@ def test_one_task_may_have_several_datasets(tmp_path: Path) -> None:
     )
     shared = RECIPE.replace('task = "micro"\n', "").replace('dataset = "zest/kitchen-micro-whole-v0"\n', "")
     comparison = read_comparison(write(tmp_path, shared.replace("[relabel]", f"{tables}\n[relabel]")))
-    assert {name: (config.task, config.level) for name, config in comparison.collect.items()} == {
+    assert {name: (config.task, config.level) for name, config in comparison.tasks.items()} == {
         "at-60": ("micro", 60.0),
         "at-95": ("micro", 95.0),
     }

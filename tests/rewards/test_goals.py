@@ -225,6 +225,16 @@ def test_sentences_for_an_embedder_of_pictures_are_refused_and_one_that_reads_th
         embed_goal(read_goal("text:closed microwave -> open microwave", MICRO), load_embedder("efficientnet-lite0"))
 
 
+def test_another_robots_task_names_a_folder_of_the_visual_tasks_dataset(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(VISUAL_TASKS_VARIABLE, str(folder.parent))
+    goal = read_free_goal("visual-tasks:goals")
+    assert (goal.name, len(goal.goals)) == ("visual-tasks:goals", 2)
+    with pytest.raises(BadInput, match=r"must hold init/ .* it holds goals"):
+        read_free_goal("visual-tasks:.")
+
+
 @pytest.mark.parametrize("spec", ["~nobody-here/goals", "a sentence without its mark " * 300])
 def test_what_names_no_folder_is_an_unknown_goal(spec: str) -> None:
     with pytest.raises(BadInput, match="unknown goal"):

@@ -42,8 +42,9 @@ def record(env_id: str, lengths: tuple[int, ...]) -> tuple[Recorder, list[list[n
 def test_a_recorded_dataset_holds_states_success_and_spaces_as_minari_reads_them() -> None:
     env, qpos = record("FetchPush-v4", (2, 3))
     env.reset(seed=9)  # without a step it is no episode
-    env.write("push/recorded-v0")
+    env.write("push/recorded-v0", ref_min_score=-50.0, ref_max_score=-10.0)
     dataset = minari.load_dataset("push/recorded-v0")
+    assert minari.get_normalized_score(dataset, np.array([-30.0])) == 0.5
     assert dataset.spec.env_spec.id == "FetchPush-v4"
     assert dataset.observation_space == env.observation_space
     for episode, states in zip(dataset, qpos, strict=True):

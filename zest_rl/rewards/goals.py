@@ -7,7 +7,7 @@ A spec is one string:
 - ``drawings``: three small drawings of a microwave, an example of a goal that is found out to be wrong;
 - a folder with ``init/`` and ``goal/``, each holding one or more pictures;
 - ``visual-tasks:real_imgs`` or ``visual-tasks:drawings``: the task's folder in the paper's Visual Tasks Dataset, at the
-  path in the environment variable ZEST_VISUAL_TASKS;
+  path in the environment variable ZEST_VISUAL_TASKS; for other robots ``visual-tasks:real_imgs/open_cabinet``;
 - ``text:closed microwave -> open microwave`` (several sentences are separated by ``|``);
 - ``text``: the task's own two sentences.
 """
@@ -121,7 +121,7 @@ def goal_folder(spec: str, task: Task) -> Path | None:
     if spec == DRAWINGS:
         return _drawings(task)
     if spec.startswith(VISUAL_TASKS):
-        return _visual_tasks(spec, task)
+        return _visual_tasks(spec) / task.goal_folder
     folder = user_path(spec)
     if not is_there(folder):
         raise BadInput(
@@ -142,14 +142,14 @@ def _drawings(task: Task) -> Path:
     return folder
 
 
-def _visual_tasks(spec: str, task: Task) -> Path:
+def _visual_tasks(spec: str) -> Path:
     root = os.environ.get(VISUAL_TASKS_VARIABLE)
     if not root:
         raise BadInput(
             f"goal {spec!r} needs the environment variable {VISUAL_TASKS_VARIABLE}: set it to your copy of the Visual "
             "Tasks Dataset (the folder that holds real_imgs/ and drawings/)"
         )
-    return Path(root) / spec.removeprefix(VISUAL_TASKS) / task.goal_folder
+    return Path(root) / spec.removeprefix(VISUAL_TASKS)
 
 
 def read_goal(spec: str, task: Task, scene: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None = None) -> GoalSpec:
@@ -191,25 +191,34 @@ def read_kitchen_goal(spec: str, views: Views, scene_qpos: NDArray[np.float64]) 
     return read_goal(spec, task, scene)
 
 
-def read_free_goal(spec: str) -> GoalSpec:
-    """Read a goal spec that needs no task: a folder, or two sentences.
+def free_goal_folder(spec: str) -> Path | None:
+    """Return the folder of pictures that a spec names without a kitchen task; None for sentences.
 
     Raises:
-        BadInput: the spec is for kitchen tasks only, or cannot be read.
+        BadInput: there is no such folder, or the spec is for kitchen tasks only.
     """
     if spec.startswith(TEXT):
-        return read_text(spec)
+        return None
+    if spec.startswith(VISUAL_TASKS):
+        return _visual_tasks(spec)
     folder = user_path(spec)
-    of_kitchen = (SAME_SCENE, TOYS, DRAWINGS, TASK_TEXT)
-    if spec in of_kitchen or spec.startswith(VISUAL_TASKS) or not is_there(folder):
-        kitchen = (
-            f"{SAME_SCENE!r}, {TOYS!r}, {DRAWINGS!r}, 'text' and '{VISUAL_TASKS}…' are of zest/Kitchen-v1's tasks alone"
-        )
+    if spec in (SAME_SCENE, TOYS, DRAWINGS, TASK_TEXT) or not is_there(folder):
+        kitchen = f"{SAME_SCENE!r}, {TOYS!r}, {DRAWINGS!r} and 'text' are of zest/Kitchen-v1's tasks alone"
         raise BadInput(
             f"frames from elsewhere need a goal of their own, got {spec!r} ({kitchen}); give --goal a folder with "
             "init/ and goal/ pictures, or 'text:closed drawer -> open drawer'"
         )
-    return read_folder(folder)
+    return folder
+
+
+def read_free_goal(spec: str) -> GoalSpec:
+    """Read a goal spec that needs no kitchen task: a folder, also one of the Visual Tasks Dataset, or two sentences.
+
+    Raises:
+        BadInput: as `free_goal_folder`, or it cannot be read.
+    """
+    folder = free_goal_folder(spec)
+    return read_text(spec) if folder is None else read_folder(folder, spec)
 
 
 def embed_goal(goal: GoalSpec, embedder: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -83,7 +83,11 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         return [episode for episode in self._episodes if episode.actions]
 
     def write(
-        self, dataset_id: str, description: str = "", *, ref_min_score: float | None = None,
+        self,
+        dataset_id: str,
+        description: str = "",
+        *,
+        ref_min_score: float | None = None,
         ref_max_score: float | None = None,
     ) -> Path:
         """Write all episodes as a new Minari dataset, and return its folder.

@@ -38,6 +38,8 @@ class TaskDatasets:
     """Goal → the one relabeled by it."""
     collect_result: Mapping[str, Any] = field(default_factory=dict)
     """What `zest collect` tells of the source."""
+    evaluate: Mapping[str, Any] = field(default_factory=dict)
+    """Arguments of `zest evaluate` for this task alone."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,8 @@ def make_cells(comparison: Comparison, datasets: Mapping[str, TaskDatasets], out
         BadInput: policies that were trained elsewhere are not there; all of them are named.
     """
     from zest_rl.agents.foreign import identify
+    from zest_rl.cli.evaluate import Config as EvaluateFlags
+    from zest_rl.cli.evaluate import settings
     from zest_rl.data.reader import open_dataset
     from zest_rl.runtime import artifacts
 
@@ -106,7 +110,8 @@ def make_cells(comparison: Comparison, datasets: Mapping[str, TaskDatasets], out
         digest = artifacts.hash_json([arguments, agent, described[dataset]])
         run = output / "cells" / f"{task}-{agent}-{goal or 'ground-truth'}-seed{seed}-{digest[:8]}"
         train |= {"run_dir": str(run)}
-        cells.append(Cell(task, name, run, agent, train, {**method.evaluate, "run": str(run)}, method.evaluation))
+        how = {**method.evaluate, **task_datasets.evaluate, "run": str(run)}
+        cells.append(Cell(task, name, run, agent, train, how, settings(load_config(EvaluateFlags, how, name))))
     if problems:
         raise BadInput("\n  ".join(["policies from elsewhere are missing; train them, then go on:", *problems]))
     return cells

@@ -8,6 +8,9 @@ A recipe has these tables (keys are the flags of the verb)::
     [collect]                       `zest collect`, for all tasks
     [tasks.NAME]                    `zest collect`, for this task; left out: the one task of [collect]. With a key
                                     task = "…" the name is free, and one task may have several datasets
+    [tasks.NAME]                    without [collect]: dataset = "ID", which is there already, of any environment;
+                                    made_by = "…", the command that makes it; env = "package.module:make", horizon and
+                                    success_key of `zest evaluate`; relabel = {…}, `zest relabel` for this task
     [relabel]                       `zest relabel`, for all goals
     [goals.NAME]                    `zest relabel`, for this goal
     [train]                         `zest train`, for all methods
@@ -25,19 +28,15 @@ rewards of its goals are worth: the page of `zest inspect`.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from zest_rl.cli.config import load_config, read_recipe
+from zest_rl.cli.reproduce.tasks import GivenDataset, checked_table, located, read_given, read_tasks
 from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.tasks import get_task
-
-if TYPE_CHECKING:
-    from zest_rl.evaluation.evaluate import EvaluationConfig
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class ComparisonTables:
     """The keys and tables of a recipe; what stands in a table is checked by the config of its verb."""
 
     title: str
-    collect: dict[str, Any]
+    collect: dict[str, Any] | None = None
     methods: dict[str, dict[str, Any]] = field(default_factory=dict)
     seeds: tuple[int, ...] = (0,)
     caveats: tuple[str, ...] = ()
@@ -99,9 +98,7 @@ class MethodArguments:
     train: Mapping[str, Any]
     """Arguments of `zest train AGENT` or `zest adopt`; dataset and seed are added per cell."""
     evaluate: Mapping[str, Any]
-    """Arguments of `zest evaluate`; the run is added per cell."""
-    evaluation: EvaluationConfig
-    """What these arguments mean."""
+    """Arguments of `zest evaluate`; the run, and what is of the task, are added per cell."""
 
 
 @dataclass(frozen=True)
@@ -109,10 +106,10 @@ class Comparison:
     """A recipe that was read and checked."""
 
     tables: ComparisonTables
-    collect: Mapping[str, Any]
-    """Task → config of `zest collect`."""
-    relabel: Mapping[str, Any]
-    """Goal → config of `zest relabel`."""
+    tasks: Mapping[str, Any]
+    """Task → config of `zest collect`, or a `GivenDataset`."""
+    relabel: Mapping[str, Mapping[str, Any]]
+    """Task → goal → config of `zest relabel`; the dataset is added per task."""
     methods: Mapping[str, MethodArguments]
 
 
@@ -122,66 +119,46 @@ def read_comparison(path: Path) -> Comparison:
     Raises:
         BadInput: an unknown key, a missing table, a wrong type, a method that names no agent or an unknown goal.
     """
-    from zest_rl.cli import relabel
-    from zest_rl.rewards.goals import goal_folder
-
     recipe = f"recipe {path}"
     table = read_recipe(path)
     if "verb" in table:
         raise BadInput(f"{recipe} is for `zest {table['verb']} --recipe {path}`, not for `zest reproduce`")
     tables = load_config(ComparisonTables, table, recipe)
-    goals = {}
-    for name, goal in tables.goals.items():
-        where = f"{recipe} [goals.{name!r}]"
-        flags = {**checked_table(tables.relabel, where, "dataset"), **checked_table(goal, where, "dataset")}
-        goals[name] = load_config(relabel.Config, {**flags, "dataset": ""}, where)
     methods = {
-        name: _read_method(tables, method, goals, f"{recipe} [methods.{name!r}]")
-        for name, method in tables.methods.items()
+        name: _read_method(tables, method, f"{recipe} [methods.{name!r}]") for name, method in tables.methods.items()
     }
     unused = {key for key, flags in tables.train.items() if isinstance(flags, dict)} - {
         method.table.agent_or_foreign for method in methods.values()
     }
     if unused:
         raise BadInput(f"{recipe} [train]: no method has the agent {', '.join(sorted(unused))}; leave its table out")
-    collect = read_tasks(tables.collect, tables.tasks, recipe)
-    for name, relabel_config in goals.items():
-        for collect_config in collect.values():
-            with located(f"{recipe} [goals.{name!r}]"):
-                goal_folder(relabel_config.goal, get_task(collect_config.task))
-    return Comparison(tables, collect, goals, methods)
-
-
-def read_tasks(collect: Mapping[str, Any], tasks: Mapping[str, Mapping[str, Any]], where: str) -> dict[str, Any]:
-    """Read the tables [collect] and [tasks.NAME]: task → config of `zest collect`.
-
-    Raises:
-        BadInput: a table is wrong, or tasks do not have as many episodes and a dataset of their own.
-    """
-    from zest_rl.cli.collect import Config
-
-    if not tasks:
-        config = load_config(Config, collect, f"{where} [collect]")
-        collected = {config.task: config}
+    tasks: Mapping[str, Any]
+    if tables.collect is None:
+        tasks = read_given(tables.tasks, recipe)
     else:
-        shared = checked_table(collect, f"{where} [collect]", "task")
-        collected = {}
-        for name, table in tasks.items():
-            here = f"{where} [tasks.{name}]"
-            collected[name] = load_config(Config, {**shared, "task": name, **checked_table(table, here)}, here)
-    sizes, ids = {config.n_episodes for config in collected.values()}, {c.dataset_id for c in collected.values()}
-    if len(sizes) > 1 or len(ids) < len(collected):
-        raise BadInput(
-            f"{where} [tasks]: every task needs as many episodes and a dataset of its own, got n_episodes "
-            f"{sorted(sizes)} and datasets {sorted(ids)}; let the dataset's id in [collect] hold {{task}}, or give "
-            "each [tasks.NAME] its own"
-        )
-    for name in collected:
-        if not re.fullmatch(r"[A-Za-z0-9_-]+", name) or name == "report":
-            raise BadInput(
-                f"{where} [tasks.{name!r}]: the name becomes a file's beside report.html; use letters, digits, - and _"
-            )
-    return collected
+        tasks = read_tasks(tables.collect, tables.tasks, recipe)
+    return Comparison(tables, tasks, {name: _read_goals(tables, task, recipe) for name, task in tasks.items()}, methods)
+
+
+def _read_goals(tables: ComparisonTables, task: Any, recipe: str) -> dict[str, Any]:
+    """Return goal → config of `zest relabel` on one task."""
+    from zest_rl.cli import relabel
+    from zest_rl.rewards.episode_goals import EPISODE
+    from zest_rl.rewards.goals import free_goal_folder, goal_folder
+
+    of_task = {**task.arguments("env"), **task.relabel} if isinstance(task, GivenDataset) else {}
+    goals = {}
+    for name, goal in tables.goals.items():
+        where, flags = f"{recipe} [goals.{name!r}]", dict[str, Any]()
+        for given in (tables.relabel, of_task, goal):
+            flags |= checked_table(given, where, "dataset")
+        goals[name] = load_config(relabel.Config, {**flags, "dataset": ""}, where)
+        with located(where):
+            if not isinstance(task, GivenDataset):
+                goal_folder(goals[name].goal, get_task(task.task))
+            elif not goals[name].goal.startswith(EPISODE):
+                free_goal_folder(goals[name].goal)
+    return goals
 
 
 def run_config(agent: str) -> type[Any]:
@@ -193,9 +170,7 @@ def run_config(agent: str) -> type[Any]:
     return config
 
 
-def _read_method(
-    tables: ComparisonTables, method: Mapping[str, Any], goals: Mapping[str, Any], where: str
-) -> MethodArguments:
+def _read_method(tables: ComparisonTables, method: Mapping[str, Any], where: str) -> MethodArguments:
     from zest_rl.agents import AGENTS, get_agent
     from zest_rl.cli import evaluate
 
@@ -205,8 +180,8 @@ def _read_method(
     if table.agent is not None:
         with located(where):
             get_agent(table.agent)
-    if table.goal is not None and table.goal not in goals:
-        raise BadInput(f"{where}: unknown goal {table.goal!r}; {nearest(table.goal, goals)}")
+    if table.goal is not None and table.goal not in tables.goals:
+        raise BadInput(f"{where}: unknown goal {table.goal!r}; {nearest(table.goal, tables.goals)}")
     seeds = tables.seeds if table.seeds is None else table.seeds
     if not seeds or not set(seeds) <= set(tables.seeds):
         raise BadInput(f"{where}: seeds must be some of the recipe's seeds {list(tables.seeds)}, got {list(seeds)}")
@@ -224,8 +199,8 @@ def _read_method(
     arguments = {**checked_table(tables.evaluate, where, "run"), **checked_table(table.evaluate, where, "run")}
     config = load_config(evaluate.Config, {**arguments, "run": ""}, f"{where} [evaluate]")
     with located(f"{where} [evaluate]"):
-        evaluation = evaluate.settings(config)
-    return MethodArguments(table, seeds, train, {"n_workers": 1, **arguments}, evaluation)
+        evaluate.settings(config)
+    return MethodArguments(table, seeds, train, {"n_workers": 1, **arguments})
 
 
 def _check_policy(
@@ -240,21 +215,3 @@ def _check_policy(
         raise BadInput(f"{where}: with several tasks the policy must hold {{task}}, got {policy!r}")
     with located(where):
         parse(policy, python)
-
-
-@contextmanager
-def located(where: str) -> Iterator[None]:
-    """Say in a refusal which part of the recipe it is about."""
-    try:
-        yield
-    except BadInput as error:
-        raise BadInput(f"{where}: {error}") from error
-
-
-def checked_table(values: Mapping[str, Any], where: str, *given: str) -> dict[str, Any]:
-    """Return a table with ``_`` for ``-`` in its keys; refuse those that `zest reproduce` itself gives."""
-    table = {key.replace("-", "_"): value for key, value in values.items()}
-    clash = sorted(table.keys() & set(given))
-    if clash:
-        raise BadInput(f"{where}: {', '.join(map(repr, clash))} is not for a recipe to set, it follows from the rest")
-    return table

@@ -13,6 +13,7 @@ from zest_rl.cli.reproduce.cells import Cell, TaskDatasets, make_cells, run_cell
 from zest_rl.cli.reproduce.comparison import Comparison
 from zest_rl.cli.reproduce.stopwatch import Stopwatch
 from zest_rl.cli.reproduce.tables import as_markdown
+from zest_rl.cli.reproduce.tasks import GivenDataset, check_given
 from zest_rl.cli.ui import Ui
 
 if TYPE_CHECKING:
@@ -36,9 +37,11 @@ def run_comparison(
     from zest_rl.report.html import write_report
     from zest_rl.runtime import artifacts
 
+    given = {name: task for name, task in comparison.tasks.items() if isinstance(task, GivenDataset)}
+    check_given(given, f"recipe {recipe}")
     code.code_now()  # as it is now: cells must not be called outdated because files change while they run
     stopwatch, was_finished = Stopwatch(output / "seconds.json"), (output / "report.html").exists()
-    datasets = {task: _make_datasets(comparison, task, n_workers, stopwatch, ui) for task in comparison.collect}
+    datasets = {task: _make_datasets(comparison, task, n_workers, stopwatch, ui) for task in comparison.tasks}
     if not comparison.methods:
         relabeled = tuple(
             dataset_id for task_datasets in datasets.values() for dataset_id in task_datasets.relabeled.values()
@@ -100,20 +103,25 @@ def run_comparison(
 def _make_datasets(
     comparison: Comparison, task: str, n_workers: int | None, stopwatch: Stopwatch, ui: Ui
 ) -> TaskDatasets:
-    """Collect and relabel."""
+    """Collect what is not given, and relabel."""
     from zest_rl.cli import collect, relabel
 
-    ui.say(f"[1/4] collect {task}")
-    with stopwatch.stage("collect"):
-        collected = collect.run(replace(comparison.collect[task], n_workers=n_workers), ui)
+    config, evaluate = comparison.tasks[task], dict[str, Any]()
+    if isinstance(config, GivenDataset):
+        ui.say(f"[1/4] {task}: given dataset {config.dataset}")
+        source, evaluate = {"dataset": config.dataset}, config.arguments("env", "horizon", "success_key")
+    else:
+        ui.say(f"[1/4] collect {task}")
+        with stopwatch.stage("collect"):
+            source = collect.run(replace(config, n_workers=n_workers), ui)
     relabeled = {}
-    for name, config in comparison.relabel.items():
+    for name, how in comparison.relabel[task].items():
         ui.say(f"[2/4] relabel {task} by goal {name!r}")
         with stopwatch.stage("relabel"):
-            made = relabel.run(replace(config, dataset=collected["dataset"], n_workers=n_workers), ui)
+            made = relabel.run(replace(how, dataset=source["dataset"], n_workers=n_workers), ui)
         relabeled[name] = made["dataset"]
-    facts = {key: value for key, value in collected.items() if key not in ("path", "next")}
-    return TaskDatasets(collected["dataset"], relabeled, facts)
+    facts = {key: value for key, value in source.items() if key not in ("path", "next")}
+    return TaskDatasets(source["dataset"], relabeled, facts, evaluate)
 
 
 def _pages(
@@ -156,17 +164,12 @@ def _pages(
 def _methods(comparison: Comparison, cells: Sequence[Cell], task: str) -> list[Method]:
     from zest_rl.report.methods import Method
 
-    return [
-        Method(
-            name,
-            tuple(cell.run for cell in cells if (cell.task, cell.method) == (task, name)),
-            method.table.kind,
-            method.table.note,
-            method.table.paper,
-            method.evaluation,
-        )
-        for name, method in comparison.methods.items()
-    ]
+    methods = []
+    for name, method in comparison.methods.items():
+        of_method, table = [cell for cell in cells if (cell.task, cell.method) == (task, name)], method.table
+        runs = tuple(cell.run for cell in of_method)
+        methods.append(Method(name, runs, table.kind, table.note, table.paper, of_method[0].evaluation))
+    return methods
 
 
 def _rows(page: Report) -> dict[str, Any]:

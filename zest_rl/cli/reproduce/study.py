@@ -25,8 +25,8 @@ from typing import Any, Literal, get_args
 
 from zest_rl.cli import select
 from zest_rl.cli.config import load_config, read_recipe
-from zest_rl.cli.reproduce.comparison import checked_table, located, read_tasks
 from zest_rl.cli.reproduce.study_tables import as_markdown, mean_over_tasks, study_page
+from zest_rl.cli.reproduce.tasks import checked_table, located, read_tasks
 from zest_rl.cli.ui import SilentUi, Ui
 from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.tasks import get_task

@@ -1,0 +1,81 @@
+"""`zest reproduce` on datasets that are there already, of any environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from tiny_comparison import write
+
+from zest_rl.cli.reproduce.comparison import read_comparison
+
+TWO = """
+title = "Given"
+
+[tasks.push]
+dataset = "given/push-v0"
+made_by = "python record.py push"
+relabel = { goal = "text:far -> near", views = 2 }
+
+[tasks.door]
+dataset = "given/door-v0"
+env = "my_robot:door"
+horizon = 50
+success_key = "open"
+relabel = { goal = "text:shut -> open" }
+
+[relabel]
+views = 3
+
+[goals.words]
+
+[goals.shuffled]
+goal = "text:closed -> open"
+shuffle = 0
+"""
+
+
+def test_the_goal_and_the_environment_may_be_those_of_each_task(tmp_path: Path) -> None:
+    comparison = read_comparison(write(tmp_path, TWO))
+    datasets = {task: given.dataset for task, given in comparison.tasks.items()}
+    assert datasets == {"push": "given/push-v0", "door": "given/door-v0"}
+    push, door = comparison.relabel["push"], comparison.relabel["door"]
+    assert (push["words"].goal, push["words"].views, push["words"].env) == ("text:far -> near", 2, None)
+    assert (door["words"].goal, door["words"].views, door["words"].env) == ("text:shut -> open", 3, "my_robot:door")
+    assert (push["shuffled"].goal, push["shuffled"].shuffle) == ("text:closed -> open", 0), "what a goal says wins"
+    asked = ("env", "horizon", "success_key")
+    assert comparison.tasks["push"].arguments(*asked) == {}
+    assert comparison.tasks["door"].arguments(*asked) == {"env": "my_robot:door", "horizon": 50, "success_key": "open"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ('"given/door-v0"', '"given/push-v0"', "[tasks]: two tasks have the same dataset"),
+        ("made_by", "made-bye", "[tasks.push]: unknown key 'made-bye'; did you mean 'made-by'"),
+        ("[tasks.door]", "[tasks.report]", "[tasks.'report']: the name becomes a file's beside report.html"),
+        ("views = 2", 'dataset = "a/b-v0"', "'dataset' is not for a recipe to set"),
+        ("[goals.words]", "[collect]\n[goals.words]", "[tasks.push]: unknown key 'made_by'"),
+        ('"text:far -> near"', '"visual-tasks:real_imgs/open_cabinet"', "set it to your copy of the Visual Tasks"),
+        (TWO[TWO.index("[tasks.push]") : TWO.index("[relabel]")], "", "names no data: give it a table [collect]"),
+        ("[relabel]", "[relabel]", "given/push-v0: python record.py push\n  given/door-v0"),
+    ],
+)
+def test_given_datasets_that_cannot_be_used_are_refused_before_anything_runs(
+    old: str,
+    new: str,
+    complaint: str,
+    refusal: Callable[..., tuple[int, str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.delenv("ZEST_VISUAL_TASKS", raising=False)
+    assert TWO.count(old) == 1
+    recipe = write(tmp_path, TWO.replace(old, new))
+    code, message = refusal("reproduce", recipe, "--output", tmp_path / "out")
+    assert code == 2
+    assert complaint in message
+    assert recipe.name in message
+    assert not (tmp_path / "minari").exists()
