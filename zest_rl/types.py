@@ -81,12 +81,12 @@ class Episode:
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """The hand-designed reward of one episode, kept apart from `Episode`: for evaluation and reports only."""
+    """What judges one episode, kept apart from `Episode`: for evaluation and reports only."""
 
     rewards: FloatArray
-    """(T,) float32, clipped progress of the task's joint in [0, 1]."""
-    success: bool
-    """The goal was reached at some step."""
+    """(T,) float32: in the kitchen, clipped progress of the task's joint in [0, 1]; elsewhere, the dataset's own."""
+    success: bool | None
+    """The goal was reached at some step; None where nothing tells it."""
 
     @property
     def episode_return(self) -> float:
@@ -102,7 +102,8 @@ class EpisodeResult:
     """Seed of the environment's reset; equal seeds give equal starts to every policy."""
     gt_return: float
     """Sum of the ground-truth rewards."""
-    success: bool
+    success: bool | None
+    """None where the environment does not tell it."""
     n_steps: int
     zest_return: float | None = None
     """Sum of the online ZeST scores; None when the policy was not scored online."""

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from zest_rl.analysis.inspection import Inspection
 from zest_rl.data.reader import dataset_path
 from zest_rl.data.video import evenly_spaced
-from zest_rl.kitchen.views import canonical_states
 from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.types import FloatArray
@@ -60,8 +59,8 @@ class EpisodeView:
     def _render(self, states: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
         """Render each distinct state once: frames (U, V, H, W, 3), and the index of each state's frame (T+1,)."""
         views = self.scorer.embedder.views
-        distinct, index = np.unique(canonical_states(states, views), axis=0, return_inverse=True)
-        return np.stack([views.shared_renderer().render(state) for state in distinct]), index.reshape(-1)
+        distinct, index = np.unique(views.canonical(states), axis=0, return_inverse=True)
+        return np.stack([np.stack(views.render(state)) for state in distinct]), index.reshape(-1)
 
 
 def best_and_worst(inspection: Inspection, *, n_workers: int | None = None) -> dict[str, EpisodeView]:

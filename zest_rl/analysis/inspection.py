@@ -100,7 +100,7 @@ def inspect(dataset_id: str) -> Inspection:
 
 def _over_time(rewards: list[FloatArray], truth: list[GroundTruth] | None) -> dict[str, FloatArray]:
     groups = {"all episodes": rewards}
-    if truth is not None:
+    if truth is not None and truth[0].success is not None:
         outcomes = list(zip(truth, rewards, strict=True))
         groups = {
             "successes": [curve for episode, curve in outcomes if episode.success],

@@ -98,15 +98,16 @@ def measure_rewards(
         figures["contradictory"] = reward_quality.share_contradictory(scores, frames)
     if truth is not None:
         returns, targets = reward_quality.returns_of(rewards), true_returns(truth)
-        success = np.array([episode.success for episode in truth])
         figures |= {
             "spearman": statistics.spearman(returns, targets),
             "kendall": reward_quality.kendall(returns, targets),
             "pairwise": reward_quality.pairwise_accuracy(returns, targets),
-            "auprc": reward_quality.average_precision(returns, success),
-            "successes": statistics.wilson(int(success.sum()), len(success)),
             "epic": reward_quality.epic_distance(scores, [episode.rewards for episode in truth]),
         }
+        told = [episode.success for episode in truth if episode.success is not None]
+        if told:
+            figures["auprc"] = reward_quality.average_precision(returns, np.array(told))
+            figures["successes"] = statistics.wilson(sum(told), len(told))
     return figures
 
 

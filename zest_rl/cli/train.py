@@ -55,7 +55,7 @@ def split_config(config: Any) -> tuple[Any, Any]:
 def run(config: Arguments, ui: Ui) -> dict[str, Any]:
     """Train, or go on training; of several processes under ``torchrun`` the first one tells."""
     from zest_rl.data.provenance import DatasetRecord
-    from zest_rl.evaluation.evaluate import is_evaluable
+    from zest_rl.evaluation.environments import is_evaluable
     from zest_rl.runtime import artifacts
     from zest_rl.training.runs import default_run_dir, train
 

@@ -21,6 +21,26 @@ if TYPE_CHECKING:
 
 MAKER = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 """``package.module:make``, a function that makes an environment; only the user may name one, never the data."""
+WRAPPERS = frozenset(
+    f"gymnasium.wrappers.{name}"
+    for name in (
+        "common:RecordEpisodeStatistics",
+        "stateful_action:RepeatAction",
+        "stateful_action:StickyAction",
+        "stateful_observation:DelayObservation",
+        "stateful_observation:FrameStackObservation",
+        "stateful_observation:TimeAwareObservation",
+        "transform_action:ClipAction",
+        "transform_action:RescaleAction",
+        "transform_observation:DtypeObservation",
+        "transform_observation:FilterObservation",
+        "transform_observation:FlattenObservation",
+        "transform_observation:RescaleObservation",
+        "transform_observation:ReshapeObservation",
+        "transform_reward:ClipReward",
+    )
+)
+"""What may be made round an environment because a file says so: they read and write no files."""
 TRUSTED_ENTRY_POINTS = ("gymnasium.", "gymnasium_robotics.", "zest_rl.")
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import h5py
@@ -126,13 +126,38 @@ def numbers(node: h5py.Group | h5py.Dataset, forms: Mapping[str, PictureForm] | 
     Raises:
         BadInput: there are no numbers.
     """
-    columns = [
-        read_array(entry, np.float32).reshape(len(entry), -1)
-        for path, entry in entries(node).items()
-        if is_numbers(entry, (forms or {}).get(path))
-    ]
-    if not columns:
+    numeric = {path: entry for path, entry in entries(node).items() if is_numbers(entry, (forms or {}).get(path))}
+    if not numeric:
         raise BadInput(f"{node.name} holds pictures only; a policy here needs numbers to act on")
-    if len({len(column) for column in columns}) > 1:
-        raise BadInput(f"the entries of {node.name} must be equally long, got {[len(c) for c in columns]}")
-    return np.concatenate(columns, axis=1)
+    if len({len(entry) for entry in numeric.values()}) > 1:
+        raise BadInput(f"the entries of {node.name} must be equally long, got {[len(e) for e in numeric.values()]}")
+    return flatten({path: read_array(entry, np.float32) for path, entry in numeric.items()})
+
+
+def flatten(numeric: Mapping[str, NDArray[Any]]) -> FloatArray:
+    """Concatenate the numbers of observations, (n, …) by their paths, in the order of `entries`: (n, width) float32."""
+    ordered = sorted(numeric, key=lambda path: path.split("/"))
+    columns = [np.asarray(numeric[path], np.float32) for path in ordered]
+    return np.concatenate([column.reshape(len(column), -1) for column in columns], axis=1)
+
+
+def observed(observations: Sequence[Any]) -> dict[str, NDArray[Any]]:
+    """Stack the observations of n environments: (n, …) by the paths that they have in a file of Minari's."""
+    first = observations[0]
+    if isinstance(first, Mapping):
+        parts = {str(name): [each[name] for each in observations] for name in first}
+    elif isinstance(first, tuple):
+        parts = {f"_index_{i}": [each[i] for each in observations] for i in range(len(first))}
+    else:
+        return {"": np.stack([np.asarray(each) for each in observations])}
+    stacked = {name: observed(part) for name, part in parts.items()}
+    return {f"{name}/{path}".rstrip("/"): array for name, arrays in stacked.items() for path, array in arrays.items()}
+
+
+def numeric_paths(observations: Sequence[Any]) -> tuple[str, ...]:
+    """Return the paths of what a policy is given of the observations of n environments, by the rule of `numbers`."""
+    with h5py.File("observations", "w", driver="core", backing_store=False) as file:
+        for path, array in observed(observations).items():
+            if array.dtype.kind in "biufS":
+                file[f"observations/{path}".rstrip("/")] = array
+        return tuple(path for path, entry in entries(file["observations"]).items() if is_numbers(entry))

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Self
 
+from zest_rl.data.env_specs import MAKER
 from zest_rl.errors import BadInput
 from zest_rl.runtime.records import field_values, from_json
 
@@ -51,7 +52,7 @@ class ScorerRecord:
     goal_share: float = 1.0
     """Share of the goals that were used."""
     views: Mapping[str, Any] | None = None
-    """Of a `ViewsRecord`, from which kitchen states were rendered; None for other frames."""
+    """Of a `ViewsRecord`, from which kitchen states were rendered; of a scorer's file, also those of another scene."""
     views_sha256: str | None = None
     """Hash of everything that such a frame depends on besides the state."""
 
@@ -59,7 +60,7 @@ class ScorerRecord:
     def from_json(cls, values: Mapping[str, Any]) -> Self:
         """Read what `to_json` returned."""
         record = cls(**field_values(cls, {**values, **values["config"]}))
-        if record.views is not None:
+        if record.views is not None and "env_spec" not in record.views:
             from_json(ViewsRecord, record.views)
         return record
 
@@ -106,7 +107,7 @@ class RelabelRecord:
 
     @property
     def is_foreign(self) -> bool:
-        """Whether the frames were not rendered from kitchen states, so that no rollout can be scored online."""
+        """Whether the frames were not rendered from kitchen states."""
         return self.frames is not None
 
     @property
@@ -204,6 +205,17 @@ class DatasetRecord:
         """The kitchen task; None for another environment."""
         name = self.env.get("kwargs", {}).get("task")
         return None if name is None or not str(self.env.get("entry_point")).startswith("zest_rl.") else str(name)
+
+    @property
+    def maker(self) -> str | None:
+        """``package.module:make`` that the user named when it was relabeled; None without any."""
+        env = None if self.relabel is None else (self.relabel.frames or {}).get("env_id")
+        return env if isinstance(env, str) and MAKER.fullmatch(env) else None
+
+    @property
+    def source_id(self) -> str:
+        """Id of the dataset that it was relabeled from; its own where it was not."""
+        return self.id if self.relabel is None else self.relabel.source
 
     @property
     def is_foreign(self) -> bool:

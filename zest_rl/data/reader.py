@@ -146,21 +146,49 @@ class Dataset:
         return self._each(read)
 
     @property
-    def has_truth(self) -> bool:
-        """Whether any episode holds the hand-designed rewards; `truth` refuses a dataset where some do not."""
+    def is_hand_rewarded(self) -> bool:
+        """Whether any episode holds the kitchen's hand-designed rewards beside its own."""
         return any(_GT_REWARD in group for group in self.groups.values())
 
+    @property
+    def has_truth(self) -> bool:
+        """Whether there is something to judge by; `truth` refuses a dataset where some episodes lack it."""
+        if self.is_hand_rewarded or self.successes() is not None:
+            return True
+        own = self._own_rewards()
+        return own is not None and all(np.isfinite(rewards).all() for rewards in own)
+
     def truth(self) -> list[GroundTruth]:
-        """Read the hand-designed rewards of every episode: for evaluation and reports only, never for a trainer.
+        """Read what judges every episode: for evaluation and reports only, never for a trainer.
+
+        The hand-designed rewards of the kitchen; of another robot its own rewards and successes, and where it has
+        successes alone, these are its rewards.
 
         Raises:
-            BadInput: no ground truth is recorded.
+            BadInput: none is recorded.
         """
-        return self._each(
-            lambda arrays: GroundTruth(
-                rewards=arrays.read(_GT_REWARD, n_more=1)[1:],
-                success=bool(arrays.read("infos/gt/success", n_more=1).any()),
+        own, successes = self._own_rewards(), self.successes()
+        if self.is_hand_rewarded or (own is None and successes is None):
+            return self._each(
+                lambda arrays: GroundTruth(
+                    rewards=arrays.read(_GT_REWARD, n_more=1)[1:],
+                    success=bool(arrays.read("infos/gt/success", n_more=1).any()),
+                )
             )
+        told = [None] * len(self.groups) if successes is None else [bool(success.any()) for success in successes]
+        rewards = [success.astype(np.float32) for success in successes or ()] if own is None else own
+        return [GroundTruth(*episode) for episode in zip(rewards, told, strict=True)]
+
+    def _own_rewards(self) -> list[FloatArray] | None:
+        """Read the rewards (T,) that were not made here; None without any, or where all are NaN."""
+        name = "rewards" if self.record.relabel is None else SOURCE_REWARD
+        if not all(name in group for group in self.groups.values()):
+            return None
+        own = self.rewards_to_keep()
+        return (
+            None
+            if any(rewards is None or np.isnan(rewards).any() for rewards in own)
+            else [rewards for rewards in own if rewards is not None]
         )
 
     def scores(self) -> list[FloatArray]:
@@ -225,14 +253,8 @@ class Dataset:
         `DatasetRecord.of_run` reads it.
 
         Raises:
-            BadInput: a policy could not be evaluated on the dataset, or as in `episodes`.
+            BadInput: as in `episodes`.
         """
-        for key in ("env_spec", "ref_min_score", "ref_max_score"):
-            if self.metadata.get(key) is None and not self.record.is_foreign:
-                raise BadInput(
-                    f"dataset {self.id} has no {key} in its metadata, so a policy could not be evaluated on it; "
-                    "give env, eval_env and both reference scores when the dataset is made"
-                )
         return {
             "id": self.id,
             "sha256": self.fingerprint(),

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from zest_rl.agents import Policy, load_policy
 from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput, nearest
+from zest_rl.evaluation.environments import KITCHEN, MAX_HORIZON, RunEnvironment, find_environment
 from zest_rl.evaluation.rollout import Rtg, Traces, run_episodes, uses_online_scores
-from zest_rl.kitchen.env import ENV_ID
+from zest_rl.evaluation.videos import episode_video
 from zest_rl.kitchen.scene import N_QPOS
 from zest_rl.kitchen.videos import Video, ensure_videos
 from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return, representative, wilson
@@ -35,6 +36,7 @@ EPISODES_PER_JOB, N_JOBS = 5, 10
 work and an interrupted evaluation loses little, large enough that a policy acts on a batch."""
 MAX_EPISODES = 10_000
 """Of an evaluation; a part holds one environment for each of its episodes in memory."""
+_REFERENCES = ("minimum", "expert")
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,16 @@ class EvaluationConfig:
     """How the return-to-go falls: online, constant or schedule (`Rtg`)."""
     target_quantile: float = 1.0
     """The target return is this quantile of the training returns: a rule fixed before evaluation."""
+    env: str | None = None
+    """``package.module:make``, a function that makes the environment; None: the dataset names it."""
+    horizon: int | None = None
+    """Steps of an episode; None: as registered, else those of the dataset's longest episode."""
+    success_key: str | None = None
+    """Of success in ``info``; None: is_success or success."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields; those that are None, which earlier versions did not have, are left out."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
     @property
     def starts(self) -> range:
@@ -66,6 +78,10 @@ class EvaluationConfig:
             problems.append(f"unknown rtg {self.rtg!r}; {nearest(self.rtg, get_args(Rtg))}")
         if not 0 <= self.target_quantile <= 1:
             problems.append(f"target_quantile must be in [0, 1], got {self.target_quantile}")
+        if self.horizon is not None and not 1 <= self.horizon <= MAX_HORIZON:
+            problems.append(
+                f"horizon must be 1 to {MAX_HORIZON} steps, got {self.horizon}; leave it out for that of the dataset"
+            )
         if problems:
             raise BadInput("; ".join(problems))
 
@@ -78,38 +94,62 @@ class Evaluation:
     config: EvaluationConfig
     target_return: float | None
     """Return that the policy was asked for; None for policies without one."""
-    minimum: float
-    expert: float
-    """Ground-truth returns that count as 0 % and 100 %."""
+    minimum: float | None
+    expert: float | None
+    """Ground-truth returns that count as 0 % and 100 %; None where the dataset has no such references."""
     episodes: tuple[EpisodeResult, ...]
     traces: Traces
-    """What `run_episodes` returns: gt_reward, gt_success (N, T+1), qpos (N, T+1, nq), score (N, T+1) when scored, and
-    of a foreign policy clipped (N,), the number of actions that left [-1, 1]."""
+    """What `run_episodes` returns, and of a foreign policy clipped (N,), the number of actions that left [-1, 1]."""
+    environment: RunEnvironment
 
     @property
     def folder(self) -> Path:
         """Folder of the result and the videos."""
         return evaluation_folder(self.run, self.config)
 
+    @property
+    def is_normalized(self) -> bool:
+        """Whether the dataset has the references of normalized returns."""
+        return self.minimum is not None
+
+    def returns(self) -> NDArray[np.float64]:
+        """Normalized return of each episode, in percent; without references, the sum of its rewards: (N,)."""
+        sums = np.array([e.gt_return for e in self.episodes])
+        return (
+            sums if self.minimum is None or self.expert is None else normalized_return(sums, self.minimum, self.expert)
+        )
+
     def normalized(self) -> NDArray[np.float64]:
-        """Normalized return of each episode, in percent: (N,)."""
-        return normalized_return(np.array([e.gt_return for e in self.episodes]), self.minimum, self.expert)
+        """Normalized return of each episode, in percent: (N,).
+
+        Raises:
+            BadInput: the dataset has no references.
+        """
+        if not self.is_normalized:
+            raise BadInput(f"{self.run.name} has no normalized returns: its dataset has no reference scores")
+        return self.returns()
 
     def summary(self) -> dict[str, Any]:
-        """Return as JSON mean with interval, IQM, success rate; of a foreign policy, the share of clipped actions."""
-        values = self.normalized()
-        success = wilson(sum(e.success for e in self.episodes), len(self.episodes))
-        return {
-            "normalized_return": asdict(bootstrap([values])),
+        """Return as JSON mean with interval, IQM, success rate; of a foreign policy, the share of clipped actions.
+
+        The mean goes by ``normalized_return``, or ``return`` without references; success is left out where no
+        environment tells it.
+        """
+        values = self.returns()
+        successes = [e.success for e in self.episodes if e.success is not None]
+        n_steps = [e.n_steps for e in self.episodes]
+        summary: dict[str, Any] = {
+            "normalized_return" if self.is_normalized else "return": asdict(bootstrap([values])),
             "iqm": float(iqm(values)),
-            "success": asdict(success),
-            "n_episodes": len(self.episodes),
-            "target_return": self.target_return,
-        } | (
-            {"clipped_actions": float(self.traces["clipped"].sum() / sum(e.n_steps for e in self.episodes))}
-            if "clipped" in self.traces
-            else {}
-        )
+        }
+        if successes:
+            summary["success"] = asdict(wilson(sum(successes), len(successes)))
+        summary |= {"n_episodes": len(self.episodes), "target_return": self.target_return}
+        if not self.environment.is_kitchen:
+            summary["mean_length"] = float(np.mean(n_steps))
+        if "clipped" in self.traces:
+            summary["clipped_actions"] = float(self.traces["clipped"].sum() / sum(n_steps))
+        return summary
 
 
 def target_return(policy: Policy, config: EvaluationConfig) -> float | None:
@@ -126,19 +166,29 @@ def _scorer(path: Path, sha256: str) -> StateScorer:
     return StateScorer.load(path, n_workers=1)
 
 
-def _evaluate_part(job: tuple[Path, EvaluationConfig, range, bool, str]) -> Traces:
-    run, config, seeds, scored, device = job
+_Job = tuple[Path, EvaluationConfig, RunEnvironment, range, bool, str]
+
+
+def _evaluate_part(job: _Job) -> Traces:
+    run, config, environment, seeds, scored, device = job
     policy = load_policy(run, device=device)
     scorer = _scorer(run / SCORER_FILE, artifacts.hash_file(run / SCORER_FILE)) if scored else None
     with one_thread():
-        arrays = run_episodes(policy, seeds, rtg=config.rtg, target_return=target_return(policy, config), scorer=scorer)
+        arrays = run_episodes(
+            policy,
+            seeds,
+            environment=environment,
+            rtg=config.rtg,
+            target_return=target_return(policy, config),
+            scorer=scorer,
+        )
     if scorer is not None:
         scorer.flush()
     return arrays
 
 
 def evaluate(
-    run: Path,
+    run: str | Path,
     config: EvaluationConfig | None = None,
     *,
     score: bool = False,
@@ -152,9 +202,9 @@ def evaluate(
 
     Args:
         run: folder of `zest_rl.training.runs.train` or `zest_rl.training.adoption.adopt`.
-        config: seeds and return-to-go; default `EvaluationConfig()`.
+        config: environment, seeds and return-to-go; default `EvaluationConfig()`.
         score: record ZeST scores even if the policy does not need them.
-        videos: also write `episode_videos`.
+        videos: also write `episode_videos`; a `Notice` tells where they cannot be drawn.
         device: where the policy runs.
         n_workers: number of processes, default one per core.
         trust: run the policy of somebody else, and load the embedder that the run names, now and from now on
@@ -162,29 +212,22 @@ def evaluate(
         on_progress: called with the number of episodes finished since the last call.
 
     Raises:
-        BadInput: the run is unfinished, is not of the kitchen, is not trusted, or has no scorer although scores are
-            needed.
-        ZestError: a part of the run is damaged.
+        BadInput: the run is unfinished, is not trusted, or has no scorer although scores are needed; or as
+            `zest_rl.evaluation.environments.find_environment`.
+        ZestError: a part of the run is damaged, or its environment cannot be made here.
     """
     config = EvaluationConfig() if config is None else config
+    run = Path(run)
     check_finished(run)
     run = run.resolve()
     policy = load_policy(run, device=device, trust=trust)
     dataset = DatasetRecord.of_run(policy.meta)
-    if not is_evaluable(dataset):
-        raise BadInput(
-            f"`zest evaluate` runs {ENV_ID} alone, and {run.name} was trained on {dataset.id}; act with it from Python "
-            f"(zest_rl.agents.load_policy), or hand the data to other code: zest export {dataset.id}"
-        )
-    if dataset.ref_min_score is None or dataset.ref_max_score is None:
-        raise BadInput(
-            f"dataset {dataset.id} of {run.name} has no reference scores, so returns cannot be normalized; give both "
-            "when the dataset is made"
-        )
+    environment = find_environment(policy.meta, env=config.env, horizon=config.horizon, success_key=config.success_key)
     scored = score or uses_online_scores(policy, config.rtg)
     if scored and not (run / SCORER_FILE).exists():
         reason = (
-            "its frames are from elsewhere, so scores cannot be made online; use --rtg constant"
+            "its frames are no states that could be rendered, so scores cannot be made online; use --rtg schedule or "
+            "constant"
             if dataset.is_foreign
             else "it was not trained on a relabeled dataset; use --rtg constant, or train on what `zest relabel` writes"
         )
@@ -192,30 +235,35 @@ def evaluate(
     if scored:
         check_scorer(run / SCORER_FILE, trust=trust)
     folder = evaluation_folder(run, config)
-    jobs = {}
+    jobs: dict[str, _Job] = {}
     for part in chunks(config.n_episodes, max(EPISODES_PER_JOB, config.n_episodes // N_JOBS)):
         seeds = range(config.seed + part.start, config.seed + part.stop)
-        jobs[f"seeds-{seeds.start}-{seeds.stop}{'-scored' if scored else ''}"] = (run, config, seeds, scored, device)
+        name = f"seeds-{seeds.start}-{seeds.stop}{'-scored' if scored else ''}"
+        jobs[name] = (run, config, environment, seeds, scored, device)
+    references = (dataset.ref_min_score, dataset.ref_max_score)
+    minimum, expert = references if None not in references else (None, None)
     with artifacts.lock(folder):
         for name in cached_jobs(_evaluate_part, jobs, folder / "parts", n_workers=n_workers, stage="rollouts"):
             if on_progress is not None:
-                on_progress(len(jobs[name][2]))
-        traces = _read_traces(folder, list(jobs), config)
+                on_progress(len(jobs[name][3]))
+        traces = _read_traces(folder, list(jobs), config, environment)
         result = Evaluation(
             run,
             config,
             target_return(policy, config),
-            dataset.ref_min_score,
-            dataset.ref_max_score,
+            minimum,
+            expert,
             _episode_results(traces, config),
             traces,
+            environment,
         )
         artifacts.write_json(
             folder / "result.json",
             {
-                "config": asdict(config),
+                "config": config.to_json(),
                 "agent": policy.agent,
-                "references": {"minimum": result.minimum, "expert": result.expert},
+                "references": {"minimum": minimum, "expert": expert},
+                **({} if environment.is_kitchen else {"environment": asdict(environment)}),
                 "summary": result.summary(),
                 "episodes": [asdict(episode) for episode in result.episodes],
                 "parts": list(jobs),
@@ -225,11 +273,6 @@ def evaluate(
         if videos:
             ensure_videos(episode_videos(result).values(), n_workers=n_workers)
     return result
-
-
-def is_evaluable(dataset: DatasetRecord) -> bool:
-    """Whether `evaluate` can run the environment of this dataset."""
-    return not dataset.is_foreign or dataset.env.get("id") == ENV_ID
 
 
 def check_finished(run: Path) -> None:
@@ -260,43 +303,59 @@ def read_evaluation(folder: Path) -> Evaluation:
         episodes = tuple(from_json(EpisodeResult, episode) for episode in result["episodes"])
         target, references = result["summary"]["target_return"], result["references"]
         target = None if target is None else float(target)
-        minimum, expert = float(references["minimum"]), float(references["expert"])
-        if len(episodes) != config.n_episodes or not -math.inf < minimum < expert < math.inf:
+        minimum, expert = (None if references[name] is None else float(references[name]) for name in _REFERENCES)
+        is_scale = minimum is expert is None or (
+            minimum is not None and expert is not None and -math.inf < minimum < expert < math.inf
+        )
+        if len(episodes) != config.n_episodes or not is_scale:
             raise ValueError(f"{len(episodes)} episodes, returns of {minimum} to {expert}")
-        traces = _read_traces(folder, [Path(name).name for name in result["parts"]], config)
+        environment = from_json(RunEnvironment, result["environment"]) if "environment" in result else KITCHEN
+        traces = _read_traces(folder, [Path(name).name for name in result["parts"]], config, environment)
         told, seen = map(_numbers, (episodes, _episode_results(traces, config)))
         if not np.allclose(told, seen, rtol=1e-9, equal_nan=True):
             raise ValueError("its episodes are not those of its parts")
-    return Evaluation(folder.parent.parent, config, target, minimum, expert, episodes, traces)
+    return Evaluation(folder.parent.parent, config, target, minimum, expert, episodes, traces, environment)
 
 
 def evaluation_folder(run: Path, config: EvaluationConfig) -> Path:
     """Return the folder of the parts, ``result.json`` and videos of `evaluate`."""
-    return run / "evaluations" / artifacts.hash_json(asdict(config))[:8]
+    return run / "evaluations" / artifacts.hash_json(config.to_json())[:8]
 
 
 def episode_videos(evaluation: Evaluation) -> dict[str, Video]:
-    """Return the videos of the best, the median and the worst episode, which need not be written yet."""
-    return {
-        which: Video(evaluation.traces["qpos"][index], evaluation.folder / f"{which}.mp4")
-        for which, index in representative(evaluation.normalized()).items()
+    """Return the videos of the best, the median and the worst episode, which need not be written yet.
+
+    Empty where the environment cannot be drawn; a `Notice` says why.
+    """
+    chosen = {
+        which: episode_video(evaluation.environment, evaluation.traces, index, evaluation.folder / f"{which}.mp4")
+        for which, index in representative(evaluation.returns()).items()
     }
+    return {which: video for which, video in chosen.items() if video is not None}
 
 
-def _read_traces(folder: Path, parts: Sequence[str], config: EvaluationConfig) -> Traces:
+def _read_traces(folder: Path, parts: Sequence[str], config: EvaluationConfig, environment: RunEnvironment) -> Traces:
     """Read the parts of an evaluation, which may be somebody else's."""
     with reading_record(folder / "parts", "delete this folder and evaluate again"):
         traces = read_parts(folder / "parts", parts)
         n, n_frames = config.n_episodes, traces["gt_reward"].shape[1]
-        layout = {
+        layout: dict[str, tuple[type[Any], tuple[int | None, ...]]] = {
             "gt_reward": (np.float32, (n, n_frames)), "gt_success": (np.bool_, (n, n_frames)),
-            "qpos": (np.float64, (n, n_frames, N_QPOS)), "score": (np.float32, (n, n_frames)),
-            "clipped": (np.int64, (n,)),
+            "score": (np.float32, (n, n_frames)), "clipped": (np.int64, (n,)), "n_steps": (np.int64, (n,)),
         }  # fmt: skip
-        for name in ("gt_reward", "gt_success", "qpos", *traces):
+        width = N_QPOS if environment.is_kitchen else None
+        layout |= dict.fromkeys(environment.state, (np.float64, (n, n_frames, width)))
+        told = () if environment.success_key is None else ("gt_success",)
+        required = ("gt_reward", *told, *environment.state, *(() if environment.is_kitchen else ("n_steps",)))
+        for name in (*required, *traces):
             array, (dtype, shape) = traces[name], layout[name]
-            if array.shape != shape or array.dtype != dtype or n_frames < 2 or not np.isfinite(array).all():
+            fits = len(array.shape) == len(shape) and all(
+                want in (None, got) for want, got in zip(shape, array.shape, strict=True)
+            )
+            if not fits or array.dtype != dtype or n_frames < 2 or not np.isfinite(array).all():
                 raise ValueError(f"{name} must be finite {np.dtype(dtype)} {shape}, got {array.dtype} {array.shape}")
+        if "n_steps" in traces and not ((traces["n_steps"] >= 1) & (traces["n_steps"] < n_frames)).all():
+            raise ValueError(f"n_steps must be 1 to {n_frames - 1}")
     return traces
 
 
@@ -310,8 +369,8 @@ def _episode_results(traces: Traces, config: EvaluationConfig) -> tuple[EpisodeR
         EpisodeResult(
             seed=config.seed + i,
             gt_return=float(traces["gt_reward"][i, 1:].sum(dtype=np.float64)),
-            success=bool(traces["gt_success"][i].any()),
-            n_steps=n_frames - 1,
+            success=bool(traces["gt_success"][i].any()) if "gt_success" in traces else None,
+            n_steps=int(traces["n_steps"][i]) if "n_steps" in traces else n_frames - 1,
             zest_return=float(traces["score"][i, 1:].sum(dtype=np.float64)) if "score" in traces else None,
         )
         for i in range(n_episodes)

@@ -131,7 +131,7 @@ def read_transitions(ds: Dataset, shape: Shape = "step", normalise: bool = False
         columns["zest_score"] = [score[1:] for score in scores]
         if (source := ds.source_rewards()) is not None:
             columns["source_reward"] = source
-    if ds.has_truth:
+    if ds.is_hand_rewarded:
         truth = ds.truth()
         columns["gt_reward"] = [episode.rewards for episode in truth]
         columns["gt_episode_success"] = [np.full(len(episode.rewards), episode.success) for episode in truth]

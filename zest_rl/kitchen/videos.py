@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from zest_rl.kitchen.scene import RenderConfig, shared_renderer
 from zest_rl.runtime.parallel import run_jobs
 from zest_rl.simulation.rendering import Camera
 from zest_rl.simulation.videos import write_mp4
+from zest_rl.types import Frame
 
 OVERVIEW = Camera(lookat=(-0.4, 0.3, 1.9), distance=2.4, azimuth=60.0, elevation=-25.0)
 """Robot, microwave, stove and cabinets in one picture."""
@@ -20,15 +22,31 @@ FPS = 12.5
 """Frames per second of the environment: a video runs in real time."""
 
 
+States: TypeAlias = NDArray[np.float64] | Mapping[str, NDArray[np.float64]]
+"""(T+1, nq) simulator positions; or, outside the kitchen, the parts of T+1 states by name."""
+
+
+class Overview(Protocol):
+    """How people see another environment than the kitchen."""
+
+    @property
+    def fps(self) -> float:
+        """Frames per second: one per step."""
+
+    def frames(self, states: States) -> Iterator[Frame]:
+        """Draw the states of an episode."""
+
+
 @dataclass(frozen=True, eq=False)
 class Video:
     """An episode and the file of its video."""
 
-    states: NDArray[np.float64]
-    """(T+1, nq) simulator positions."""
+    states: States
     path: Path
-    beside: NDArray[np.float64] | None = None
-    """(T+1, nq) of another episode, shown on the right."""
+    beside: States | None = None
+    """Of another episode, shown on the right."""
+    overview: Overview | None = None
+    """None: of the kitchen."""
 
 
 Film = Callable[[Video], Path]
@@ -37,11 +55,22 @@ Film = Callable[[Video], Path]
 
 def write_video(video: Video, size: int = 320) -> Path:
     """Render an episode and write it as H.264, atomically; `size` is the side of the square frames, in even pixels."""
-    episodes = [video.states] if video.beside is None else [video.states, video.beside]
-    renderer = shared_renderer(RenderConfig(size=size, robot=True), (OVERVIEW,))
-    frames = (np.hstack([renderer.render(qpos)[0] for qpos in step]) for step in zip(*episodes, strict=True))
-    write_mp4(video.path, frames, FPS)
+    overview = _Kitchen(size) if video.overview is None else video.overview
+    episodes = [overview.frames(states) for states in (video.states, video.beside) if states is not None]
+    # each step is drawn before the next: they share a simulation
+    write_mp4(video.path, (np.hstack(step) for step in zip(*episodes, strict=True)), overview.fps)
     return video.path
+
+
+@dataclass(frozen=True)
+class _Kitchen:
+    size: int
+    fps: float = FPS
+
+    def frames(self, states: States) -> Iterator[Frame]:
+        assert not isinstance(states, Mapping)
+        renderer = shared_renderer(RenderConfig(size=self.size, robot=True), (OVERVIEW,))
+        return (renderer.render(qpos)[0] for qpos in states)
 
 
 def ensure_video(video: Video) -> Path:

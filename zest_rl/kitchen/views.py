@@ -6,12 +6,13 @@ With the robot hidden a frame depends on the objects' joints alone, so many stat
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.errors import BadInput
-from zest_rl.kitchen.scene import RenderConfig, open_renderer, relevant_qpos, shared_renderer, task_cameras
+from zest_rl.kitchen.scene import N_QPOS, RenderConfig, open_renderer, relevant_qpos, shared_renderer, task_cameras
 from zest_rl.kitchen.tasks import Task, get_task
 from zest_rl.runtime import artifacts
 from zest_rl.simulation.rendering import Camera, StateRenderer
@@ -50,6 +51,23 @@ class Views:
         """Hash of everything that a frame depends on besides the state."""
         cameras = [[*c.lookat, c.distance, c.azimuth, c.elevation] for c in self.cameras]
         return artifacts.hash_json([self.render_config.fingerprint(), cameras, self.tolerance])
+
+    @property
+    def width(self) -> int:
+        """Numbers in a state."""
+        return N_QPOS
+
+    def read(self, env: Any, first: NDArray[np.float64] | None) -> NDArray[np.float64]:
+        """Return the state of a `KitchenEnv`: (nq,)."""
+        return np.array(env.data.qpos)
+
+    def canonical(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Round states to the grid and zero what no frame depends on: (N, nq) → (N, nq)."""
+        return canonical_states(states, self)
+
+    def render(self, state: NDArray[np.float64]) -> list[NDArray[np.uint8]]:
+        """Draw a state: V frames (H, W, 3)."""
+        return list(self.shared_renderer().render(state))
 
     def renderer(self) -> StateRenderer:
         """Open a renderer of these views; close it after use."""

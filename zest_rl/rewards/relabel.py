@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,7 +27,8 @@ from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.parallel import Engine
 from zest_rl.runtime.privacy import masked
-from zest_rl.sources import KitchenStates, Source, open_source
+from zest_rl.sources import EpisodeFrames, KitchenStates, Source, open_source
+from zest_rl.sources.scenes import SceneStates
 from zest_rl.types import FloatArray
 
 Reward = Literal["level", "difference"]
@@ -219,7 +220,7 @@ def relabel_source(
             description=f"Rewards are scores ({config.similarity}+{config.features}, {reward}) "
             f"by {masked(config.embedder)}.",
             zest={"relabel": record.to_json()},
-            extra=lambda folder: _write_scorer(folder, scorer),
+            extra=lambda folder: _write_scorer(folder, scorer, source.frames),
         )
     return result(scorer, n_still)
 
@@ -237,9 +238,11 @@ def _open(
     return scorer, StateEmbeddings(StateScorer.of(scorer, **options).embedder, frames.states)
 
 
-def _write_scorer(folder: Path, scorer: Scorer) -> None:
+def _write_scorer(folder: Path, scorer: Scorer, frames: EpisodeFrames) -> None:
     """Save the scorer in a dataset's folder if it can score online, and thumbnails of the goal's pictures."""
-    if scorer.views is not None:
+    if isinstance(frames, SceneStates):
+        replace(scorer, views=frames.state_views()).save(folder / SCORER_FILE)
+    elif scorer.views is not None:
         scorer.save(folder / SCORER_FILE)
     goal = scorer.goal
     if goal is None or goal.is_text:

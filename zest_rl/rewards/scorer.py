@@ -7,7 +7,7 @@ file (the goal's embeddings) with its config, so that the goal pictures are not 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -37,6 +37,9 @@ from zest_rl.runtime.files import check_file
 from zest_rl.runtime.parallel import one_thread
 from zest_rl.runtime.records import from_json, reading_record
 from zest_rl.runtime.trust import check_trusted, remember
+from zest_rl.simulation.makers import check_named
+from zest_rl.sources.scene_views import SceneViews
+from zest_rl.sources.states import check_env
 from zest_rl.types import FloatArray
 
 SCORER_FILE = "zest_scorer.safetensors"
@@ -73,8 +76,8 @@ class Scorer:
     goal_sha256: str
     """Hash of the goal's content, before any choice among its pictures."""
     embedder_sha256: str
-    views: Views | None = None
-    """Views of the kitchen from which frames are rendered; None for other frames, which cannot be rendered."""
+    views: Views | SceneViews | None = None
+    """How the frames are rendered from states; None where they are not, and where a dataset holds their embeddings."""
     goal: GoalSpec | None = None
     """The goal itself; None when only its embeddings were loaded."""
 
@@ -193,12 +196,12 @@ class Scorer:
         """Read what `save` wrote.
 
         Raises:
-            BadInput: the file names an embedder that this user did not, nor trust (`check_scorer`).
+            BadInput: the file names an embedder or environment that this user did not, nor trust (`check_scorer`).
             ZestError: the file is missing or damaged, or the embedder or renderer here differs from the one that was
                 used (scores would not be comparable).
         """
         config, views, saved, starts, goals = _read(path)
-        _check_embedder(path, config)
+        _check_named(path, config, views)
         embedder = shared_embedder(config.embedder, config.precision, device)
         scorer = cls(config, starts, goals, saved.goal_sha256, embedder.fingerprint, views)
         record = scorer.record
@@ -221,25 +224,30 @@ def check_scorer(path: Path, *, trust: bool = False) -> None:
 
     Args:
         path: of the file.
-        trust: let it load the embedder that it names, from now on.
+        trust: let it load the embedder and make the environment that it names, from now on.
 
     Raises:
-        BadInput: it names an embedder that this user did not.
+        BadInput: it names an embedder or environment that this user did not.
         ZestError: the file is missing or damaged.
     """
-    config = _read(path)[0]
+    config, views, *_ = _read(path)
     if trust:
         remember("embedder", config.embedder)
-    _check_embedder(path, config)
+        if isinstance(views, SceneViews):
+            remember("environment", views.env_spec)
+    _check_named(path, config, views)
 
 
-def _check_embedder(path: Path, config: ScorerConfig) -> None:
-    """Refuse an embedder that data name: a family may run a package, read a file, or download weights."""
+def _check_named(path: Path, config: ScorerConfig, views: Views | SceneViews | None) -> None:
+    """Refuse what data name: an embedder may run a package, read a file, or download weights; an environment runs."""
     if config.embedder != DEFAULT_EMBEDDER:
         check_trusted("embedder", config.embedder, f"{path} would load the embedder {config.embedder}")
+    if isinstance(views, SceneViews):
+        check_named(views.env_spec, f"the scorer {path}")
+        check_env(views.env_spec, f"the scorer {path}")
 
 
-def _read(path: Path) -> tuple[ScorerConfig, Views | None, ScorerRecord, FloatArray, FloatArray]:
+def _read(path: Path) -> tuple[ScorerConfig, Views | SceneViews | None, ScorerRecord, FloatArray, FloatArray]:
     """Read a scorer's file: config, views, both with the hashes of what they mean, starts and goals."""
     from safetensors import safe_open
 
@@ -251,7 +259,7 @@ def _read(path: Path) -> tuple[ScorerConfig, Views | None, ScorerRecord, FloatAr
             described = json.loads(file.metadata()["scorer"])
             starts, goals = file.get_tensor("starts"), file.get_tensor("goals")
         values = dict(described["config"])
-        views = from_json(Views, values.pop("views")) if "views" in values else None
+        views = _read_views(values.pop("views")) if "views" in values else None
         config = from_json(ScorerConfig, values)
         for array in (starts, goals):
             if (
@@ -261,10 +269,14 @@ def _read(path: Path) -> tuple[ScorerConfig, Views | None, ScorerRecord, FloatAr
                 or not np.isfinite(array).all()
             ):
                 raise ValueError(f"{array.dtype} embeddings of shape {array.shape}, or not finite")
-        n_views = starts.shape[:-2] if views is None else (len(views.cameras),)[: starts.ndim - 2]
+        n_views = starts.shape[:-2] if views is None else (views.n_views,)[: starts.ndim - 2]
         if not (starts.shape[:-2] == goals.shape[:-2] == n_views and starts.shape[-1] == goals.shape[-1]):
             raise ValueError(f"starts of shape {starts.shape} beside goals of shape {goals.shape}")
         return config, views, ScorerRecord.from_json(described), starts, goals
+
+
+def _read_views(values: Mapping[str, Any]) -> Views | SceneViews:
+    return SceneViews.from_json(values) if "env_spec" in values else from_json(Views, values)
 
 
 def embed_goal_cached(goal: GoalSpec, embedder: Embedder) -> tuple[FloatArray, FloatArray]:

@@ -1,6 +1,6 @@
 """Simulator states → embeddings of all views, each distinct state rendered and embedded once, cached by content.
 
-The cache is a folder of shards ``keys (n, nq) float64, embeddings (n, V, D) float32``; its name is a hash of
+The cache is a folder of shards ``keys (n, width) float64, embeddings (n, V, D) float32``; its name is a hash of
 everything that an embedding depends on. Any process may add shards; each is written atomically and never changed.
 
 One state is one batch of V frames on one thread, so that its embedding does not depend on the states embedded with it:
@@ -23,14 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.embedders import Precision
-from zest_rl.kitchen.scene import N_QPOS
-from zest_rl.kitchen.views import Views, canonical_states, distinct_states
 from zest_rl.rewards.embeddings import N_CHECKED, EmbeddedEpisode, WorkerEmbedder, check_equal, shared_embedder
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import Layout, read_arrays, write_arrays
 from zest_rl.runtime.cache import cache_folder
 from zest_rl.runtime.parallel import Engine, cached_jobs, chunks, one_thread, run_jobs
-from zest_rl.simulation.views import state_keys
+from zest_rl.simulation.views import each_once, state_keys
+from zest_rl.sources.base import StateViews
 from zest_rl.types import FloatArray
 
 STATES_PER_SHARD = 32
@@ -42,15 +41,15 @@ SHARDS_IN_MEMORY = 64
 class _Job:
     """Some states to embed."""
 
-    views: Views
+    views: StateViews
     embedder: WorkerEmbedder
     states: NDArray[np.float64]
 
 
 def _embed_states(job: _Job) -> dict[str, NDArray[np.generic]]:
-    renderer, embedder = job.views.shared_renderer(), job.embedder.load()
+    embedder = job.embedder.load()
     with one_thread():
-        embeddings = [embedder.embed_images(list(renderer.render(state))) for state in job.states]
+        embeddings = [embedder.embed_images(list(job.views.render(state))) for state in job.states]
     return {"keys": job.states, "embeddings": np.stack(embeddings)}
 
 
@@ -66,7 +65,7 @@ class StateEmbedder:
 
     def __init__(
         self,
-        views: Views,
+        views: StateViews,
         embedder: str,
         precision: Precision = "auto",
         *,
@@ -94,20 +93,20 @@ class StateEmbedder:
     def _index_shards(self) -> None:
         """Index the states of new shards; a damaged shard is removed."""
         for path in sorted(set(self.folder.glob("*.npz")) - self._read):
-            if (arrays := read_arrays(path, {"keys": (np.float64, (None, N_QPOS))})) is None:
+            if (arrays := read_arrays(path, {"keys": (np.float64, (None, self.views.width))})) is None:
                 path.unlink(missing_ok=True)
                 continue
             self._where.update((key, (path, row)) for row, key in enumerate(state_keys(arrays["keys"])))
             self._read.add(path)
 
-    def embed(self, qpos: NDArray[np.float64], on_progress: Callable[[int, int], None] | None = None) -> None:
+    def embed(self, states: NDArray[np.float64], on_progress: Callable[[int, int], None] | None = None) -> None:
         """Embed the states that are not in the cache, on all cores.
 
         Args:
-            qpos: (N, nq) simulator positions.
+            states: (N, width).
             on_progress: called with (shards done, shards in all).
         """
-        states = distinct_states(qpos, self.views)  # in the order of the episodes: an episode needs few shards
+        states = each_once(self.views.canonical(states))  # in the order of the episodes: an episode needs few shards
         self._check(state_keys(states))
         missing = states[[key not in self._where for key in state_keys(states)]]
         if len(missing) == 0:
@@ -123,13 +122,13 @@ class StateEmbedder:
         self.n_embedded += len(missing)
         self._index_shards()
 
-    def embedded(self, qpos: NDArray[np.float64]) -> EmbeddedEpisode:
-        """Read the embeddings of one episode, (T+1, nq) simulator positions; a few shards are in memory at a time.
+    def embedded(self, states: NDArray[np.float64]) -> EmbeddedEpisode:
+        """Read the embeddings of one episode, (T+1, width) states; a few shards are in memory at a time.
 
         What turns out to be damaged is embedded again, in this process.
         """
-        states, inverse = np.unique(canonical_states(qpos, self.views), axis=0, return_inverse=True)
-        rows = self.embed_now(states)
+        distinct, inverse = np.unique(self.views.canonical(states), axis=0, return_inverse=True)
+        rows = self.embed_now(distinct)
         self.flush()
         inverse = np.asarray(inverse).reshape(-1)
         return EmbeddedEpisode(np.concatenate([rows[inverse[:1]], rows]), 1 + inverse)
@@ -168,11 +167,11 @@ class StateEmbedder:
     def _layout(self, job: _Job) -> Layout:
         return {"keys": (np.float64, job.states.shape), "embeddings": (np.float32, (len(job.states), *self._form))}
 
-    def embed_now(self, qpos: NDArray[np.float64]) -> FloatArray:
-        """Embed states in this process, for use within a rollout: (N, nq) → (N, V, D). Call `flush` at the end."""
-        states = canonical_states(qpos, self.views)
+    def embed_now(self, states: NDArray[np.float64]) -> FloatArray:
+        """Embed states in this process, for use within a rollout: (N, width) → (N, V, D). Call `flush` at the end."""
+        rendered = self.views.canonical(states)
         rows = []
-        for state, key in zip(states, state_keys(states), strict=True):
+        for state, key in zip(rendered, state_keys(rendered), strict=True):
             if (row := self._row(key)) is None:
                 self._check(self._where)
                 job = _Job(self.views, self.embedder, state[None])
@@ -200,7 +199,7 @@ class StateEmbeddings:
     unit: ClassVar[str] = "distinct_states"
 
     def __init__(self, embedder: StateEmbedder, states: Sequence[NDArray[np.float64]]) -> None:
-        """Take the (T+1, nq) simulator positions of every episode."""
+        """Take the states (T+1, width) of every episode."""
         self._embedder, self._states = embedder, states
 
     @property

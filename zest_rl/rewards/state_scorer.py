@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.errors import ZestError
-from zest_rl.kitchen.views import Views, canonical_states
+from zest_rl.kitchen.views import Views
 from zest_rl.rewards.goals import read_kitchen_goal
 from zest_rl.rewards.scorer import Scorer, ScorerConfig
 from zest_rl.rewards.state_embeddings import StateEmbedder, StateEmbeddings
@@ -20,7 +20,7 @@ from zest_rl.types import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class StateScorer:
-    """Scores states of the kitchen; each is rendered and embedded once."""
+    """Scores states of the environment that its scorer sees (`StateViews`); each is rendered and embedded once."""
 
     scorer: Scorer
     embedder: StateEmbedder
@@ -33,7 +33,7 @@ class StateScorer:
             ZestError: the scorer's frames are not rendered from states.
         """
         if scorer.views is None:
-            raise ZestError("the frames of this scorer are from elsewhere, so it cannot score states")
+            raise ZestError("the frames of this scorer are no rendered states, so it cannot score states")
         config = scorer.config
         return cls(scorer, StateEmbedder(scorer.views, config.embedder, config.precision, device=device, **options))
 
@@ -68,8 +68,9 @@ class StateScorer:
         return cls.of(Scorer.load(path, device=device), device=device, **options)
 
     def seen_as(self, task: str) -> Self:
-        """Return a scorer with the same goals that sees states from the views of another task."""
+        """Return a scorer with the same goals that sees the kitchen's states from the views of another task."""
         cache = self.embedder
+        assert isinstance(cache.views, Views), "only the kitchen has tasks"
         scorer = replace(self.scorer, views=replace(cache.views, task=task))
         return self.of(scorer, device=cache.embedder.device, n_workers=cache.n_workers, engine=cache.engine)
 
@@ -78,17 +79,17 @@ class StateScorer:
         return replace(self, scorer=self.scorer.with_goals(kept))
 
     def embeddings(self, states: Sequence[NDArray[np.float64]]) -> StateEmbeddings:
-        """Embed whole episodes, (T+1, nq) simulator positions each."""
+        """Embed whole episodes, (T+1, width) states each."""
         embeddings = StateEmbeddings(self.embedder, states)
         embeddings.embed()
         return embeddings
 
     def score_episode(self, states: NDArray[np.float64]) -> FloatArray:
-        """Score a whole episode: (T+1, nq) → (T+1,) float32."""
+        """Score a whole episode: (T+1, width) → (T+1,) float32."""
         return self.scorer.score_episodes(self.embeddings([states]))[0][0]
 
     def by_view(self, states: NDArray[np.float64]) -> FloatArray:
-        """Score one episode by each view alone: (T+1, nq) → (V, T+1) float32."""
+        """Score one episode by each view alone: (T+1, width) → (V, T+1) float32."""
         (episode,) = self.embeddings([states])
         return self.scorer.by_view(episode)
 
@@ -96,14 +97,14 @@ class StateScorer:
         """Score one state of each of N running episodes; `flush` writes their embeddings to the cache.
 
         Args:
-            first: (N, nq) their first states.
-            current: (N, nq) their current states.
+            first: (N, width) their first states.
+            current: (N, width) their current states.
 
         Returns:
             (N,) float32 scores.
         """
         scores = np.empty(len(current), dtype=np.float32)
-        _, group = np.unique(canonical_states(first, self.embedder.views), axis=0, return_inverse=True)
+        _, group = np.unique(self.embedder.views.canonical(first), axis=0, return_inverse=True)
         for g in range(group.max() + 1):  # mostly one group: the objects start alike
             rows = np.flatnonzero(group.reshape(-1) == g)
             states = np.concatenate([first[rows[:1]], current[rows]])
@@ -119,8 +120,8 @@ class StateScorer:
         """Score many states, each against its own start, embedded on all cores.
 
         Args:
-            first: (N, nq) start states, x_0 of each.
-            current: (N, nq) states.
+            first: (N, width) start states, x_0 of each.
+            current: (N, width) states.
             on_progress: called with (parts embedded, parts in all).
 
         Returns:

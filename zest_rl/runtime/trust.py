@@ -1,9 +1,9 @@
 """Whom this user trusts: what data may run or load by naming it, see ``SECURITY.md``.
 
 A dataset or a run of somebody else may name a policy or a network, and with it a program, a package or a file. It is
-used only if this user named the very same on this machine (`zest adopt`, ``--embedder``) or trusted it by ``--trust``.
-What was named lies in the folder ``trusted`` of the cache, a small file each, policies by the content of their files
-and embedders by name: delete one to forget it.
+used only if this user named the very same on this machine (`zest adopt`, ``--embedder``, ``--env``) or trusted it by
+``--trust``. What was named lies in the folder ``trusted`` of the cache, a small file each, policies by the content of
+their files, embedders and functions that make environments by name: delete one to forget it.
 """
 
 from __future__ import annotations
@@ -20,12 +20,17 @@ def remember(kind: str, named: Any) -> None:
     """Keep that this user named it.
 
     Args:
-        kind: ``embedder`` or ``policy``.
+        kind: ``embedder``, ``environment`` or ``policy``.
         named: all that defines it, JSON-ready.
     """
     path = _record(kind, named)
     if not path.exists():
         artifacts.write_json(path, {kind: named})
+
+
+def is_remembered(kind: str, named: Any) -> bool:
+    """Whether this user named it; arguments as in `remember`."""
+    return _record(kind, named).exists()
 
 
 def check_trusted(kind: str, named: Any, what: str) -> None:
@@ -39,7 +44,7 @@ def check_trusted(kind: str, named: Any, what: str) -> None:
     Raises:
         BadInput: it was not named on this machine.
     """
-    if not _record(kind, named).exists():
+    if not is_remembered(kind, named):
         shown = "".join(c if c.isprintable() else repr(c)[1:-1] for c in what)  # a terminal obeys escape sequences
         raise BadInput(
             f"{shown}. You did not name this {kind} on this machine; if you trust whoever did, add --trust (in Python "

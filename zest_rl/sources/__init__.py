@@ -18,12 +18,12 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from zest_rl.data import reader
-from zest_rl.data.env_specs import MAKER
 from zest_rl.data.observations import choose_pictures, joined, rejected
 from zest_rl.data.writer import DatasetCopy, Trajectories
 from zest_rl.errors import BadInput
 from zest_rl.kitchen.views import Views
 from zest_rl.runtime.files import is_there, user_path
+from zest_rl.simulation.makers import named_by_user
 from zest_rl.simulation.scene import SceneConfig
 from zest_rl.sources.base import EpisodeFrames, Source
 from zest_rl.sources.kitchen import KitchenStates, read_kitchen
@@ -79,8 +79,8 @@ def open_source(
         BadInput: no such dataset, or its frames are missing or ambiguous; the message lists the candidates.
     """
     with nullcontext() if _is_path(dataset) else reader.open_dataset(dataset) as ds:
-        if env is not None and MAKER.fullmatch(env) is None:
-            raise BadInput(f"--env must be package.module:make, a function that makes an environment, got {env!r}")
+        if env is not None:
+            named_by_user(env)
         of_scenes = {"--robot": bool(robot), "--look-at": look_at is not None}
         rendering = {
             **of_scenes,

@@ -6,6 +6,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+from numpy.typing import NDArray
+
 from zest_rl.data.writer import Trajectories
 from zest_rl.types import Frame
 
@@ -36,6 +39,33 @@ class RenderedFrames(Protocol):
 
     def ends(self, episode: int) -> tuple[Sequence[Frame], Sequence[Frame]]:
         """Return the V frames of x_0, and those of x_T."""
+
+
+class StateViews(Protocol):
+    """How states are rendered, each a row of numbers: of recorded episodes and of running environments alike.
+
+    Sent to worker processes, so it is small and frozen.
+    """
+
+    @property
+    def n_views(self) -> int:
+        """V."""
+
+    @property
+    def width(self) -> int:
+        """Numbers in a state."""
+
+    def fingerprint(self) -> str:
+        """Hash of everything that a frame depends on besides the state."""
+
+    def read(self, env: Any, first: NDArray[np.float64] | None) -> NDArray[np.float64]:
+        """Return the state (width,) of an environment without its wrappers; `first`: that of x_0, None at x_0."""
+
+    def canonical(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the states that are rendered instead, (N, width) → (N, width); equal ones have equal frames."""
+
+    def render(self, state: NDArray[np.float64]) -> Sequence[Frame]:
+        """Draw a canonical state: V frames (H, W, 3)."""
 
 
 @dataclass(frozen=True)

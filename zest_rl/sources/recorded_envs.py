@@ -5,7 +5,7 @@ One row of `RECORDED_ENVS` is one environment; without a row only the recorded `
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,6 +55,25 @@ class RecordedEnv:
         for owner, names in ((env.model, MODEL_FIELDS), (env.data, DATA_FIELDS)):
             for name in set(names) & set(state):
                 getattr(owner, name).flat = state[name]
+
+
+def running_state(env: Any, names: Sequence[str]) -> dict[str, Doubles]:
+    """Return the state of an environment (without its wrappers) by the names under which datasets record it.
+
+    What it does not have is left out.
+    """
+    own: Mapping[str, Any] = env.get_env_state() if hasattr(env, "get_env_state") else {}
+    found: dict[str, Any] = {}
+    for name in names:
+        if name in MODEL_FIELDS and hasattr(env, "model"):
+            found[name] = getattr(env.model, name)
+        elif name in DATA_FIELDS and hasattr(env, "data"):
+            found[name] = getattr(env.data, name)
+        elif name in own:
+            found[name] = own[name]
+        elif name == "desired_goal" and hasattr(env, "goal"):
+            found[name] = env.goal
+    return {name: np.array(value, np.float64).ravel() for name, value in found.items()}
 
 
 def _put_hand(env: Any, state: State) -> None:

@@ -6,7 +6,6 @@ from names that the user gives.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -28,83 +27,17 @@ from zest_rl.simulation.bodies import (
     robot_bodies,
     subtree,
 )
-from zest_rl.simulation.framing import (
-    HIDDEN_GROUP,
-    ObjectRing,
-    Point,
-    azimuth_of,
-    centre,
-    object_geoms,
-    radius,
-    robot_side,
-)
+from zest_rl.simulation.framing import ObjectRing, azimuth_of, centre, radius, robot_side
 from zest_rl.simulation.rendering import Camera
 from zest_rl.simulation.scene import SceneConfig
-from zest_rl.simulation.views import on_grid
 from zest_rl.sources.recorded_envs import Doubles, State
-from zest_rl.sources.stage import SIZE, Simulation, env_facts, make_simulation
+from zest_rl.sources.scene_views import VERSION, SceneStage, SceneViews, as_rendered, scene_stage, shared_simulation
+from zest_rl.sources.stage import SIZE, Simulation, env_facts
 from zest_rl.sources.states import States, check_env, recorded_states, versions
 from zest_rl.types import Frame
 
-_VERSION = 1  # raise it when a pixel changes, here or in simulation/: cached embeddings depend on it
 _EPISODES, _STEPS, _STARTS = 50, 20, 8  # of a dataset, of which it is seen what moves, and what hides it
 _EXTENT = 0.9  # quantile over episodes: what one throws off the table does not move the cameras away
-
-
-class SceneStage:
-    """A simulation in which some bodies are hidden, drawn without marks, shadows and sky."""
-
-    def __init__(self, simulation: Simulation, hidden: Bodies) -> None:
-        """Open a GL context; see `scene_stage`."""
-        self.simulation, model = simulation, simulation.model
-        groups, marks = simulation.groups, robot_bodies(model) & ~hidden  # marks on a robot in view are part of it
-        self._geoms = np.where(hidden[model.geom_bodyid], HIDDEN_GROUP, groups.geoms)
-        self._sites = np.where(marks[model.site_bodyid], groups.sites, HIDDEN_GROUP)
-        self._canvas = simulation.open_canvas(())
-        self._canvas.hide_tendons()
-
-    def lookat(self, state: State, body: int) -> Point:
-        """Return the middle of a body as it stands in a state, in metres."""
-        self.simulation.put(state)
-        return centre(self.simulation.model, self.simulation.data, body)
-
-    def render(self, state: State, cameras: Sequence[Camera]) -> list[Frame]:
-        """Draw one state: one (H, W, 3) frame per camera."""
-        self._place(state, cameras)
-        return list(self._canvas.draw(self.simulation.data))
-
-    def seen_shares(self, state: State, cameras: Sequence[Camera], body: int) -> NDArray[np.float64]:
-        """Return which share of a body each camera sees, of what it would see of the body alone: (V,) in [0, 1].
-
-        1 where the body is out of sight for other reasons.
-        """
-        self._place(state, cameras)
-        model, geoms = self.simulation.model, object_geoms(self.simulation.model, body)
-        in_scene = np.isin(self._canvas.segments(self.simulation.data), geoms).sum(axis=(1, 2))
-        model.geom_group[np.setdiff1d(np.arange(model.ngeom), geoms)] = HIDDEN_GROUP
-        alone = np.isin(self._canvas.segments(self.simulation.data), geoms).sum(axis=(1, 2))
-        return np.where(alone > 0, in_scene / np.maximum(alone, 1), 1.0)
-
-    def _place(self, state: State, cameras: Sequence[Camera]) -> None:
-        self.simulation.put(state)
-        model = self.simulation.model
-        model.geom_group[:], model.site_group[:] = self._geoms, self._sites
-        self._canvas.cameras = tuple(camera.to_mujoco() for camera in cameras)
-
-
-@functools.cache
-def _simulation(env_spec: str) -> Simulation:
-    """Return this process's environment, whose model is drawn by `SceneStage` alone."""
-    return make_simulation(env_spec)
-
-
-@functools.cache
-def scene_stage(env_spec: str, hidden: tuple[int, ...]) -> SceneStage:
-    """Return this process's stage of an environment with these bodies hidden; raises as `make_simulation`."""
-    simulation = _simulation(env_spec)
-    mask = np.zeros(simulation.model.nbody, bool)
-    mask[list(hidden)] = True
-    return SceneStage(simulation, mask)
 
 
 @dataclass(frozen=True)
@@ -142,7 +75,7 @@ class SceneStates:
         """Hash the states as they are rendered, the environment with its versions and its model, and the views."""
         recorded, model = self._canonical(episode), self._stage.simulation.model_sha256
         seen = [self.hidden, self.body, asdict(self.ring), SIZE]
-        settings = [self.states.env_spec, versions(), model, seen, _VERSION, sorted(recorded)]
+        settings = [self.states.env_spec, versions(), model, seen, VERSION, sorted(recorded)]
         return artifacts.hash_json([artifacts.hash_arrays(*(recorded[name] for name in sorted(recorded))), settings])
 
     def read(self, episode: int) -> Iterator[Sequence[Frame]]:
@@ -166,24 +99,19 @@ class SceneStates:
         return rows, self.ring.cameras(self._stage.lookat(rows[0], self.body))
 
     def _canonical(self, episode: int) -> dict[str, Doubles]:
-        """Read states with qpos on the grid, and the robot at rest."""
-        recorded, model = self.states.read_states(episode), self._stage.simulation.model
-        shown = np.ones(model.nq, bool)
-        for joint in np.flatnonzero(np.isin(model.jnt_bodyid, self.hidden)):
-            adr = model.jnt_qposadr[joint]
-            shown[adr : adr + _WIDTHS[model.jnt_type[joint]]] = False
-        on = on_grid(recorded["qpos"], shown, self.tolerance)
-        recorded["qpos"] = np.where(shown, on, model.qpos0)
-        if np.isin(np.flatnonzero(model.body_mocapid >= 0), self.hidden).all():
-            recorded = {name: values for name, values in recorded.items() if not name.startswith("mocap_")}
-        return recorded
+        """Read states as they are rendered."""
+        return as_rendered(self._stage.simulation.model, self.hidden, self.tolerance, self.states.read_states(episode))
+
+    def state_views(self) -> SceneViews:
+        """Return how any state of the environment is rendered, recorded or not."""
+        recorded = {name: values.shape[1] for name, values in self._canonical(0).items()}
+        names = sorted(recorded)
+        widths = tuple(recorded[name] for name in names)
+        return SceneViews(self.states.env_spec, tuple(names), widths, self.hidden, self.body, self.ring, self.tolerance)
 
     @property
     def _stage(self) -> SceneStage:
         return scene_stage(self.states.env_spec, self.hidden)
-
-
-_WIDTHS = (7, 4, 1, 1)  # entries of qpos of a free joint, a ball, a slide and a hinge
 
 
 def find_scene(
@@ -203,7 +131,7 @@ def find_scene(
         ZestError: the environment cannot be made here.
     """
     checked = check_env(env_spec, what)
-    simulation = _simulation(checked)
+    simulation = shared_simulation(checked)
     states = recorded_states(file, episodes, checked, simulation, what, marks=False)
     model = simulation.model
     robot = subtree(model, bodies_named(model, config.robot, "--robot")) if config.robot else robot_bodies(model)

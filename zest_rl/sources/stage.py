@@ -8,14 +8,11 @@ from __future__ import annotations
 
 import atexit
 import functools
-import importlib
 import json
-import sys
 from collections.abc import Callable
 from contextlib import redirect_stderr
 from dataclasses import dataclass
 from io import StringIO
-from pathlib import Path
 from typing import Any
 
 import zest_rl.runtime.load_order  # isort: skip
@@ -28,6 +25,7 @@ import zest_rl.kitchen.env  # noqa: F401  # registers its environment, and those
 from zest_rl.data.env_specs import MAKER, check_registered, without_wrappers
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime import artifacts
+from zest_rl.simulation.makers import find_maker
 from zest_rl.simulation.recorder import DATA_FIELDS, MODEL_FIELDS
 from zest_rl.simulation.rendering import Canvas
 from zest_rl.sources import state_plugins
@@ -161,7 +159,7 @@ def make_simulation(env_spec: str) -> Simulation:
         ZestError: the environment cannot be made with the packages here.
     """
     if MAKER.fullmatch(env_spec):
-        return Simulation(_bare(functools.partial(_call, env_spec), env_spec), env_spec)
+        return Simulation(_bare(lambda: find_maker(env_spec)(), env_spec), env_spec)
     try:
         spec = gymnasium.envs.registration.EnvSpec.from_json(without_wrappers(env_spec))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -178,19 +176,13 @@ def make_simulation(env_spec: str) -> Simulation:
     return Simulation(env, str(spec.entry_point))
 
 
-def _call(maker: str) -> Any:
-    """Import a function of the working directory or an installed package, and call it."""
-    module, _, name = maker.partition(":")
-    if (here := str(Path.cwd())) not in sys.path:
-        sys.path.insert(0, here)
-    return getattr(importlib.import_module(module), name)()
-
-
 def _bare(make: Callable[[], Any], name: str) -> Any:
     """Make an environment, and return it without its wrappers."""
     try:
         with redirect_stderr(StringIO()):  # on import gymnasium_robotics prints news of its other environments
             env: Any = make().unwrapped
+    except BadInput:
+        raise
     except Exception as error:  # whatever an environment raises
         raise ZestError(
             f"{name} cannot be made here ({type(error).__name__}: {error}); install what it needs, or give --frames "

@@ -1,0 +1,79 @@
+"""``package.module:make``: environments that no file can name, made by a function that the user names.
+
+Only the user may name one, by ``--env`` or, once he did, by what he relabeled with it on this machine
+(`zest_rl.runtime.trust`); data alone never runs code.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from zest_rl.data.env_specs import MAKER
+from zest_rl.errors import BadInput, nearest
+from zest_rl.runtime.trust import is_remembered, remember
+
+
+def named_by_user(env: str) -> str:
+    """Return what ``--env`` holds, and remember that the user named it.
+
+    Raises:
+        BadInput: it is not ``package.module:make``.
+    """
+    if MAKER.fullmatch(env) is None:
+        raise BadInput(f"--env must be package.module:make, a function that makes an environment, got {env!r}")
+    remember("environment", env)
+    return env
+
+
+def check_named(env: str, what: str) -> None:
+    """Refuse a function that data name as their environment, unless this user named it on this machine.
+
+    Raises:
+        BadInput: it would run code that this user did not name.
+    """
+    if MAKER.fullmatch(env) and not is_remembered("environment", env):
+        raise BadInput(
+            f"{what} names {env} as the function that makes its environment, which you did not name on this machine; "
+            f"if you know its code, give --env {env}, which runs it"
+        )
+
+
+def find_maker(maker: str) -> Callable[[], Any]:
+    """Import a function of the working directory or an installed package.
+
+    Raises:
+        BadInput: there is no such module or function, or it needs arguments.
+    """
+    module_name, _, name = maker.partition(":")
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if not f"{module_name}.".startswith(f"{error.name}."):
+            raise
+        raise BadInput(
+            f"--env {maker}: there is no module {error.name!r} in {here} or among the installed packages; write "
+            "package.module:make, where package/module.py is in this folder or installed"
+        ) from error
+    make: Any = getattr(module, name, None)
+    if not callable(make):
+        functions = [known for known, value in vars(module).items() if inspect.isfunction(value)]
+        raise BadInput(f"--env {maker}: {module_name} has no function {name!r}; {nearest(name, functions)}")
+    try:
+        inspect.signature(make).bind()
+    except TypeError as error:
+        raise BadInput(
+            f"--env {maker}: {name}{inspect.signature(make)} must be called without arguments ({error}); write a "
+            f"function that makes it with the right ones, e.g. def make(): return {name}(…)"
+        ) from error
+    except ValueError:
+        pass  # a builtin, whose arguments are not known
+    found: Callable[[], Any] = make
+    return found
