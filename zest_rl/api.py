@@ -164,7 +164,8 @@ def evaluate(
         n_workers: processes, default one per core.
         trust: run the policy, and load the embedder, that a run of somebody else names, now and from now on.
         on_progress: called with the number of episodes finished since the last call.
-        **flags: the fields of `zest_rl.evaluation.evaluate.EvaluationConfig`: n_episodes, seed, rtg, target_quantile.
+        **flags: the fields of `zest_rl.evaluation.evaluate.EvaluationConfig`: n_episodes, seed, rtg, target_quantile,
+            env, horizon, success_key.
     """
     from zest_rl.evaluation.evaluate import EvaluationConfig
     from zest_rl.evaluation.evaluate import evaluate as evaluate_run

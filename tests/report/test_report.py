@@ -250,7 +250,7 @@ def test_figures_that_are_not_finite_are_shown_as_a_dash(report: Report) -> None
         report,
         RESULTS((MethodRow("not run", nan, nan, nan, inf, nan, 0, 0, paper_value=nan),)),
         GOALS((dataclasses.replace(report.items(GOALS)[0], spearman=nan),)),
-        EPISODES((dataclasses.replace(report.items(EPISODES)[0], scores=scores, normalized_return=nan),)),
+        EPISODES((dataclasses.replace(report.items(EPISODES)[0], scores=scores, value=nan),)),
         RANKING((Scatter("s", np.array([1, 2, inf], np.float32), np.array([1, nan, 2], np.float32), nan, (nan, nan)),)),
         LEARNING_CURVES((Curve("BC", "loss", np.zeros(2, np.float32), np.full(2, nan, np.float32)),)),
         DETAILS((("config", {"target": nan, "limits": [inf, np.float32("nan")], "array": np.array([nan])}),)),

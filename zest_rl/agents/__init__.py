@@ -41,7 +41,7 @@ def get_agent(name: str) -> Agent[Any]:
     return AGENTS[name]
 
 
-def load_policy(run_dir: Path, device: str = "cpu", *, trust: bool = False) -> Policy:
+def load_policy(run_dir: str | Path, device: str = "cpu", *, trust: bool = False) -> Policy:
     """Return the policy of a finished run; it acts in the precision it was trained in.
 
     Args:
@@ -54,6 +54,7 @@ def load_policy(run_dir: Path, device: str = "cpu", *, trust: bool = False) -> P
         BadInput: there is no such device, ``meta.json`` is not as this package writes it, its agent is unknown here, or
             a foreign policy is not trusted or cannot be read.
     """
+    run_dir = Path(run_dir)
     place, path = find_device(device), run_dir / "meta.json"
     meta: dict[str, Any] = read_json(path)
     with reading_record(path):

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Config:
-    """Evaluate a trained policy: normalized ground-truth return and success, with 95 % intervals."""
+    """Evaluate a policy in the environment of its dataset: return (normalized if there are references), success."""
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """Folder that `zest train` or `zest adopt` left."""
@@ -26,6 +26,12 @@ class Config:
     """Episodes; equal seeds give equal starts to every policy."""
     seed: int = 1_000_000
     """First seed of the starts."""
+    env: str | None = None
+    """package.module:make, a function that makes the environment. Default: the dataset names it."""
+    horizon: int | None = None
+    """Steps of an episode. Default: as registered, else those of the dataset's longest episode."""
+    success_key: str | None = None
+    """Of success in info, such as success or task/solved. Default: is_success or success."""
     rtg: Literal["online", "constant", "schedule"] = "online"
     """How the return-to-go falls: by the online score, not at all, or as in the best training episode."""
     target_quantile: float = 1.0
@@ -35,7 +41,7 @@ class Config:
     videos: bool = True
     """Write videos of the best, median and worst episode."""
     device: str = "cpu"
-    """Where the policy runs; those with a process of their own decide for themselves."""
+    """Where the policy runs; one with a process of its own decides itself."""
     n_workers: int | None = None
     """Processes; default one per core."""
     trust: bool = False
@@ -55,8 +61,8 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     if clipped := summary.get("clipped_actions"):
         ui.warn(f"{clipped:.1%} of the actions left [-1, 1] and were clipped, as the environment does")
     videos = episode_videos(result) if config.videos else {}
-    folder = evaluation_folder(config.run, asked)
     ensure_videos(videos.values(), n_workers=config.n_workers)
+    folder = evaluation_folder(config.run, asked)
     return {
         "run": str(config.run),
         **summary,
@@ -68,11 +74,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
 
 def settings(config: Config) -> EvaluationConfig:
-    """Return what is to be run.
-
-    Raises:
-        BadInput: a value is out of range.
-    """
+    """Return what is to be run; raises `BadInput` if a value is out of range."""
     from zest_rl.evaluation.evaluate import EvaluationConfig
 
-    return EvaluationConfig(config.n_episodes, config.seed, config.rtg, config.target_quantile)
+    return EvaluationConfig(**{name: getattr(config, name) for name in EvaluationConfig.__dataclass_fields__})

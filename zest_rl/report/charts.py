@@ -273,5 +273,5 @@ def progress_chart(panel: EpisodePanel) -> Markup:
     lines = [Line(steps, panel.gt_progress, "gt")]
     if panel.beside is not None:
         lines.append(Line(steps, panel.beside[1], "c1"))
-    label = f"Ground-truth progress over {len(steps) - 1} steps of {panel.title}"
-    return line_chart(lines, label, tall=False, y_holds=(0, 1), scrub=True)
+    label = f"{panel.gt_name} over {len(steps) - 1} steps of {panel.title}"
+    return line_chart(lines, label, tall=False, y_holds=(0, 1) if panel.is_progress else (), scrub=True)

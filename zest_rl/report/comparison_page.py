@@ -62,7 +62,7 @@ def dataset_row(*dataset_ids: str, paper: float | None = None) -> MethodRow:
         with open_dataset(dataset_id) as ds:
             facts, truth = ds.describe(), ds.truth()
         groups.append([normalized_return(true_returns(truth), facts["ref_min_score"], facts["ref_max_score"])])
-        successes += [episode.success for episode in truth]
+        successes += [bool(episode.success) for episode in truth]
     return _row(
         groups,
         float(np.mean(successes)),

@@ -86,19 +86,30 @@ class EpisodePanel:
     title: str
     method: str
     seed: int
-    normalized_return: float
-    """In %."""
-    success: bool
+    value: float
+    """Normalized return in %, or the return itself."""
+    success: bool | None
+    """None where the environment does not tell it."""
     video: Path
     """MP4 file with H.264 video, which every browser plays; the page embeds it."""
     fps: float
     """Episode steps per second of video: the frame rate when every step is one frame."""
     gt_progress: FloatArray
-    """(T+1,) float32, the ground-truth progress of the task's joint in [0, 1]; marked as evaluation only."""
+    """(T+1,) float32, the ground-truth progress of the task's joint in [0, 1], or the environment's rewards; marked as
+    evaluation only."""
     scores: FloatArray | None = None
     """(T+1,) float32, the ZeST score of every frame; None when the policy was not scored."""
     beside: tuple[str, FloatArray] | None = None
     """Another method on the same start, to the left in the video: its name and progress (T+1,) float32."""
+    is_normalized: bool = True
+    """Whether `value` is in %."""
+    is_progress: bool = True
+    """Whether `gt_progress` is progress rather than rewards."""
+
+    @property
+    def gt_name(self) -> str:
+        """What `gt_progress` is."""
+        return "Ground-truth progress" if self.is_progress else "Reward of the environment"
 
     def __post_init__(self) -> None:
         if not 0 < self.fps < math.inf:

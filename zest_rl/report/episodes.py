@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zest_rl.evaluation.evaluate import Evaluation
-from zest_rl.kitchen.videos import FPS, Film, Video
+from zest_rl.evaluation.videos import episode_video, frames_per_second
+from zest_rl.kitchen.videos import Film
 from zest_rl.metrics.statistics import representative
 from zest_rl.report.content import EpisodePanel
 from zest_rl.rewards.state_scorer import StateScorer
@@ -20,13 +20,22 @@ from zest_rl.types import FloatArray
 def representative_episodes(
     name: str, evaluation: Evaluation, scorer: StateScorer | None, film: Film
 ) -> list[EpisodePanel]:
-    """Return the best, the median and the worst episode: video, score over time, ground-truth progress."""
+    """Return the best, the median and the worst episode: video, score over time, ground-truth progress.
+
+    None where the environment cannot be drawn. Outside the kitchen the scores are those of the rollout, if it has any.
+    """
     episodes = []
-    for which, index in representative(evaluation.normalized()).items():
-        states: NDArray[np.float64] = evaluation.traces["qpos"][index]
-        video = film(Video(states, evaluation.folder / f"{which}.mp4"))
-        scores = None if scorer is None else scorer.score_episode(states)
-        episodes.append(_panel(f"{name}: {which}", name, evaluation, index, video, scores=scores))
+    for which, index in representative(evaluation.returns()).items():
+        video = episode_video(evaluation.environment, evaluation.traces, index, evaluation.folder / f"{which}.mp4")
+        if video is None:
+            continue
+        n_frames = evaluation.episodes[index].n_steps + 1
+        scores = None
+        if not evaluation.environment.is_kitchen:
+            scores = evaluation.traces["score"][index, :n_frames] if "score" in evaluation.traces else None
+        elif scorer is not None:
+            scores = scorer.score_episode(evaluation.traces["qpos"][index])
+        episodes.append(_panel(f"{name}: {which}", name, evaluation, index, n_frames, film(video), scores=scores))
     return episodes
 
 
@@ -35,37 +44,45 @@ def paired_episodes(left: tuple[str, Evaluation], right: tuple[str, Evaluation],
 
     Args:
         left: name and evaluation of one policy.
-        right: of the other; the list is empty if the starts differ.
+        right: of the other; the list is empty if the starts or the environments differ.
         film: makes the videos.
     """
     (left_name, before), (right_name, after) = left, right
-    if before.config.starts != after.config.starts:
+    if before.config.starts != after.config.starts or before.environment != after.environment:
         return []
     episodes = []
-    returns = before.normalized()
-    for which, index in representative(after.normalized() - returns).items():
-        left_qpos, right_qpos = before.traces["qpos"][index], after.traces["qpos"][index]
-        name = f"pair-{artifacts.hash_arrays(left_qpos, right_qpos)[:8]}.mp4"
-        video = film(Video(left_qpos, after.folder / name, beside=right_qpos))
-        title = f"{left_name} (left, {returns[index]:.0f} %) beside {right_name} (right): {which} gain"
-        beside = (left_name, _progress(before, index))
-        episodes.append(_panel(title, right_name, after, index, video, beside=beside))
+    returns = before.returns()
+    for which, index in representative(after.returns() - returns).items():
+        n_frames = max(each.episodes[index].n_steps for each in (before, after)) + 1
+        states = [each.traces[part][index] for each in (before, after) for part in after.environment.state]
+        path = after.folder / f"pair-{artifacts.hash_arrays(*states)[:8]}.mp4"
+        video = episode_video(after.environment, before.traces, index, path, beside=after.traces)
+        if video is None:
+            continue
+        unit = " %" if before.is_normalized else ""
+        title = f"{left_name} (left, {returns[index]:.0f}{unit}) beside {right_name} (right): {which} gain"
+        beside = (left_name, _progress(before, index, n_frames))
+        episodes.append(_panel(title, right_name, after, index, n_frames, film(video), beside=beside))
     return episodes
 
 
-def _panel(title: str, name: str, evaluation: Evaluation, index: int, video: Path, **drawn: Any) -> EpisodePanel:
+def _panel(
+    title: str, name: str, evaluation: Evaluation, index: int, n_frames: int, video: Path, **drawn: Any
+) -> EpisodePanel:
     return EpisodePanel(
         title=title,
         method=name,
         seed=evaluation.episodes[index].seed,
-        normalized_return=float(evaluation.normalized()[index]),
+        value=float(evaluation.returns()[index]),
         success=evaluation.episodes[index].success,
         video=video,
-        fps=FPS,
-        gt_progress=_progress(evaluation, index),
+        fps=frames_per_second(evaluation.environment),
+        gt_progress=_progress(evaluation, index, n_frames),
+        is_normalized=evaluation.is_normalized,
+        is_progress=evaluation.environment.is_kitchen,
         **drawn,
     )
 
 
-def _progress(evaluation: Evaluation, index: int) -> FloatArray:
-    return np.asarray(evaluation.traces["gt_reward"][index], dtype=np.float32)
+def _progress(evaluation: Evaluation, index: int, n_frames: int) -> FloatArray:
+    return np.asarray(evaluation.traces["gt_reward"][index, :n_frames], dtype=np.float32)

@@ -105,7 +105,8 @@ def adopt(
             for file, content in files.items():
                 artifacts.write_bytes(staging / file, content)
             _try(foreign.load(staging, request, torch.device("cpu")), episodes[:N_TRIED])
-            artifacts.write_json(staging / "meta.json", request | {"made_by": artifacts.provenance()})
+            told = {"max_steps": facts.max_steps, "made_by": artifacts.provenance()}
+            artifacts.write_json(staging / "meta.json", request | told)
     return run_dir
 
 

@@ -1,0 +1,72 @@
+"""From a recording to a report in other environments than the kitchen, by the commands that a user types."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
+import gymnasium
+import gymnasium_robotics  # noqa: F401  # registers its environments
+import numpy as np
+import pytest
+
+from zest_rl.runtime import artifacts
+from zest_rl.simulation.recorder import Recorder
+
+Run = Callable[..., dict[str, Any]]
+SMALL = ("--n-updates", 5, "--hidden-size", 16, "--n-layers", 1, "--device", "cpu", "--threads", 1)
+ENVIRONMENTS = {
+    "AdroitHandDoor-v1": ("--look-at", "door"),
+    "FetchPush-v4": ("--show-robot",),
+    "FetchReach-v4": ("--show-robot", "--look-at", "robot0:gripper_link"),
+    "PointMaze_UMaze-v3": ("--show-robot",),
+    "Hopper-v5": ("--show-robot", "--look-at", "torso"),
+}
+"""Environment → what is to be seen of it."""
+
+
+def record(env_id: str, dataset_id: str, n_episodes: int = 3, n_steps: int = 10, **options: Any) -> str:
+    """Episodes of a real environment in which one random action is held."""
+    env = Recorder(gymnasium.make(env_id))
+    env.action_space.seed(0)
+    for seed in range(n_episodes):
+        env.reset(seed=seed)
+        action = env.action_space.sample()
+        for _ in range(n_steps):
+            *_, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                break
+    env.write(dataset_id, **options)
+    return dataset_id
+
+
+@pytest.fixture(autouse=True)
+def _places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "minari").mkdir()
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_an_environment_goes_from_a_recording_to_a_report(env_id: str, zest: Run, tmp_path: Path) -> None:
+    source = record(env_id, "some/robot-v0")
+    scored = zest("relabel", source, "--goal", "episode:0", "--views", 1, "--n-workers", 1, *ENVIRONMENTS[env_id])
+    inspected = zest("inspect", scored["dataset"], "--n-workers", 1)
+    assert "Spearman ρ" in inspected["datasets"][scored["dataset"]]["figures"], "its own rewards judge"
+    trained = zest("train", "rvs", scored["dataset"], *SMALL)
+    assert trained["next"].startswith("zest evaluate")
+    words = ("--n-episodes", 2, "--horizon", 4, "--n-workers", 1)
+    evaluated = zest("evaluate", trained["run"], *words)
+    assert evaluated.keys() & {"return", "normalized_return"} == {"return"}, "there are no references"
+    assert ("success" in evaluated) == (env_id != "Hopper-v5")
+    assert evaluated["mean_length"] == 4
+    assert all(Path(video).stat().st_size > 500 for video in evaluated["videos"].values())
+    assert evaluated["videos"].keys() == {"best", "median", "worst"}
+    result = artifacts.read_json(Path(evaluated["result"]))
+    assert all(episode["zest_return"] is not None for episode in result["episodes"]), "it was scored online"
+    reported = zest("report", trained["run"], "--output", tmp_path / "report.html")
+    assert reported["rows"]
+    assert np.isfinite(list(reported["rows"].values())).all()
