@@ -6,14 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
-import gymnasium
-import gymnasium_robotics  # noqa: F401  # registers its environments
 import numpy as np
 import pytest
+from recorded_robots import record
 
 from zest_rl.runtime import artifacts
-from zest_rl.simulation.recorder import Recorder
 
 Run = Callable[..., dict[str, Any]]
 SMALL = ("--n-updates", 5, "--hidden-size", 16, "--n-layers", 1, "--device", "cpu", "--threads", 1)
@@ -27,21 +24,6 @@ ENVIRONMENTS = {
 """Environment → what is to be seen of it."""
 
 
-def record(env_id: str, dataset_id: str, n_episodes: int = 3, n_steps: int = 10, **options: Any) -> str:
-    """Episodes of a real environment in which one random action is held."""
-    env = Recorder(gymnasium.make(env_id))
-    env.action_space.seed(0)
-    for seed in range(n_episodes):
-        env.reset(seed=seed)
-        action = env.action_space.sample()
-        for _ in range(n_steps):
-            *_, terminated, truncated, _ = env.step(action)
-            if terminated or truncated:
-                break
-    env.write(dataset_id, **options)
-    return dataset_id
-
-
 @pytest.fixture(autouse=True)
 def _places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
@@ -52,8 +34,10 @@ def _places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_an_environment_goes_from_a_recording_to_a_report(env_id: str, zest: Run, tmp_path: Path) -> None:
-    source = record(env_id, "some/robot-v0")
-    scored = zest("relabel", source, "--goal", "episode:0", "--views", 1, "--n-workers", 1, *ENVIRONMENTS[env_id])
+    record(env_id, "some/robot-v0")
+    scored = zest(
+        "relabel", "some/robot-v0", "--goal", "episode:0", "--views", 1, "--n-workers", 1, *ENVIRONMENTS[env_id]
+    )
     inspected = zest("inspect", scored["dataset"], "--n-workers", 1)
     assert "Spearman ρ" in inspected["datasets"][scored["dataset"]]["figures"], "its own rewards judge"
     trained = zest("train", "rvs", scored["dataset"], *SMALL)
