@@ -51,6 +51,3 @@ def test_an_environment_goes_from_a_recording_to_a_report(env_id: str, zest: Run
     assert evaluated["videos"].keys() == {"best", "median", "worst"}
     result = artifacts.read_json(Path(evaluated["result"]))
     assert all(episode["zest_return"] is not None for episode in result["episodes"]), "it was scored online"
-    reported = zest("report", trained["run"], "--output", tmp_path / "report.html")
-    assert reported["rows"]
-    assert np.isfinite(list(reported["rows"].values())).all()

@@ -153,10 +153,8 @@ class Dataset:
     @property
     def has_truth(self) -> bool:
         """Whether there is something to judge by; `truth` refuses a dataset where some episodes lack it."""
-        if self.is_hand_rewarded or self.successes() is not None:
-            return True
-        own = self._own_rewards()
-        return own is not None and all(np.isfinite(rewards).all() for rewards in own)
+        judged = self._own_rewards() is not None or self.successes() is not None
+        return self.is_hand_rewarded or (judged and self.record.task is None)
 
     def truth(self) -> list[GroundTruth]:
         """Read what judges every episode: for evaluation and reports only, never for a trainer.
@@ -167,29 +165,25 @@ class Dataset:
         Raises:
             BadInput: none is recorded.
         """
-        own, successes = self._own_rewards(), self.successes()
-        if self.is_hand_rewarded or (own is None and successes is None):
+        if self.is_hand_rewarded or not self.has_truth:
             return self._each(
                 lambda arrays: GroundTruth(
                     rewards=arrays.read(_GT_REWARD, n_more=1)[1:],
                     success=bool(arrays.read("infos/gt/success", n_more=1).any()),
                 )
             )
+        own, successes = self._own_rewards(), self.successes()
         told = [None] * len(self.groups) if successes is None else [bool(success.any()) for success in successes]
         rewards = [success.astype(np.float32) for success in successes or ()] if own is None else own
         return [GroundTruth(*episode) for episode in zip(rewards, told, strict=True)]
 
     def _own_rewards(self) -> list[FloatArray] | None:
-        """Read the rewards (T,) that were not made here; None without any, or where all are NaN."""
+        """Read the rewards (T,) that were not made here; None without any, or where some are no finite numbers."""
         name = "rewards" if self.record.relabel is None else SOURCE_REWARD
         if not all(name in group for group in self.groups.values()):
             return None
-        own = self.rewards_to_keep()
-        return (
-            None
-            if any(rewards is None or np.isnan(rewards).any() for rewards in own)
-            else [rewards for rewards in own if rewards is not None]
-        )
+        own = [rewards for rewards in self.rewards_to_keep() if rewards is not None and np.isfinite(rewards).all()]
+        return own if len(own) == len(self.groups) else None
 
     def scores(self) -> list[FloatArray]:
         """Read the ZeST scores (T+1,) of every episode.
