@@ -328,7 +328,7 @@ def test_a_horizon_out_of_range_is_refused(robots: Path) -> None:
 def test_frames_that_are_no_states_cannot_be_scored_online(robots: Path, tmp_path: Path) -> None:
     run = edited(robots, "door", tmp_path, lambda meta: None)
     (run / SCORER_FILE).unlink()
-    with pytest.raises(BadInput, match=r"its frames are no states that could be rendered.*use --rtg schedule or const"):
+    with pytest.raises(BadInput, match=r"its frames are from elsewhere.*use --rtg schedule or const"):
         evaluate(run, SHORT)
     assert evaluate(run, EvaluationConfig(2, 0, "schedule", horizon=3), n_workers=1).episodes[0].zest_return is None
 

@@ -226,8 +226,8 @@ def evaluate(
     scored = score or uses_online_scores(policy, config.rtg)
     if scored and not (run / SCORER_FILE).exists():
         reason = (
-            "its frames are no states that could be rendered, so scores cannot be made online; use --rtg schedule or "
-            "constant"
+            "its frames are from elsewhere, so scores cannot be made online; use --rtg schedule or constant (recorded "
+            "states, relabeled without --frames and --camera, could be scored)"
             if dataset.is_foreign
             else "it was not trained on a relabeled dataset; use --rtg constant, or train on what `zest relabel` writes"
         )
