@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
+import gymnasium
+import gymnasium_robotics  # noqa: F401  # registers its environments
 import pytest
 from tiny_comparison import write
 
 from zest_rl.cli.reproduce.comparison import read_comparison
+from zest_rl.simulation.recorder import Recorder
 
 TWO = """
 title = "Given"
@@ -79,3 +84,72 @@ def test_given_datasets_that_cannot_be_used_are_refused_before_anything_runs(
     assert complaint in message
     assert recipe.name in message
     assert not (tmp_path / "minari").exists()
+
+
+PUSH = """
+title = "Given"
+
+[tasks.push]
+dataset = "given/push-v0"
+horizon = 5
+relabel = { show_robot = true, look_at = "robot0:gripper_link" }
+
+[relabel]
+views = 1
+
+[goals.episode]
+goal = "episode:0"
+
+[train]
+n_updates = 20
+warmup_updates = 0
+hidden_size = 16
+n_layers = 1
+
+[evaluate]
+n_episodes = 2
+videos = false
+
+[methods.BC]
+agent = "bc"
+goal = "episode"
+
+[methods."ZeST+RvS"]
+agent = "rvs"
+goal = "episode"
+
+[methods."GT-reward RvS"]
+agent = "rvs"
+kind = "control"
+"""
+
+
+def test_methods_are_compared_on_a_dataset_of_another_robot(
+    tmp_path: Path, zest: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "minari").mkdir()
+    env = Recorder(gymnasium.make("FetchPush-v4"))
+    env.action_space.seed(0)
+    for seed in range(3):
+        env.reset(seed=seed)
+        for _ in range(4):
+            env.step(env.action_space.sample())
+    env.write("given/push-v0", ref_min_score=-10.0, ref_max_score=0.0)
+    words = ["reproduce", write(tmp_path, PUSH), "--output", tmp_path / "out", "--n-workers", "1"]
+    result = zest(*words)
+    assert {name: (row["kind"], row["n_episodes"]) for name, row in result["rows"].items()} == {
+        "Demo": ("dataset", 3),
+        "BC": ("method", 2),
+        "ZeST+RvS": ("method", 2),
+        "GT-reward RvS": ("control", 2),
+    }
+    assert result["rows"]["Demo"]["normalized_return"] == pytest.approx(60), "-4 of -10 to 0"
+    assert result["rows"]["BC"]["normalized_return"] == pytest.approx(50), "5 steps, as the recipe says"
+    assert result["rows"]["BC"]["success"] == 0
+    assert result["tasks"]["push"]["dataset"] == {"dataset": "given/push-v0"}
+    assert list(result["seconds_by_stage"]) == ["relabel", "train and evaluate", "report"], "nothing is collected"
+    html = (tmp_path / "out" / "report.html").read_text()
+    assert all(part in html for part in ("ZeST+RvS", "given/push-v0", "episode:0"))
+    assert zest(*words)["n_cells_run"] == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -43,11 +44,11 @@ from zest_rl.training.checkpoints import snapshots
 
 def method_row(method: Method, *tasks: Sequence[Evaluation]) -> MethodRow:
     """Summarise the evaluations of one method: per task, one per seed."""
-    groups = [[evaluation.normalized() for evaluation in evaluations] for evaluations in tasks]
+    groups = [[evaluation.returns() for evaluation in evaluations] for evaluations in tasks]
     episodes = [episode for evaluations in tasks for evaluation in evaluations for episode in evaluation.episodes]
     return _row(
         groups,
-        float(np.mean([episode.success for episode in episodes])),
+        [episode.success for episode in episodes],
         method=method.name,
         kind=method.kind,
         note=method.note,
@@ -57,15 +58,16 @@ def method_row(method: Method, *tasks: Sequence[Evaluation]) -> MethodRow:
 
 def dataset_row(*dataset_ids: str, paper: float | None = None) -> MethodRow:
     """Summarise the datasets themselves, one per task (the paper's "Demo")."""
-    groups, successes = [], []
+    groups, successes = [], list[bool | None]()
     for dataset_id in dataset_ids:
         with open_dataset(dataset_id) as ds:
-            facts, truth = ds.describe(), ds.truth()
-        groups.append([normalized_return(true_returns(truth), facts["ref_min_score"], facts["ref_max_score"])])
-        successes += [bool(episode.success) for episode in truth]
+            record, truth = ds.record, ds.truth()
+        returns, minimum, expert = true_returns(truth), record.ref_min_score, record.ref_max_score
+        groups.append([returns if minimum is None or expert is None else normalized_return(returns, minimum, expert)])
+        successes += [episode.success for episode in truth]
     return _row(
         groups,
-        float(np.mean(successes)),
+        successes,
         method="Demo",
         kind="dataset",
         note="the dataset's own episodes",
@@ -73,8 +75,8 @@ def dataset_row(*dataset_ids: str, paper: float | None = None) -> MethodRow:
     )
 
 
-def _row(groups: list[list[NDArray[np.float64]]], success_rate: float, **named: Any) -> MethodRow:
-    """Summarise normalized returns, one (N,) array per task and seed."""
+def _row(groups: list[list[NDArray[np.float64]]], successes: Sequence[bool | None], **named: Any) -> MethodRow:
+    """Summarise returns, one (N,) array per task and seed, and successes; None is one that nothing tells."""
     estimate = bootstrap(*groups)
     values = np.concatenate([group for task in groups for group in task])
     return MethodRow(
@@ -82,7 +84,7 @@ def _row(groups: list[list[NDArray[np.float64]]], success_rate: float, **named: 
         ci_low=estimate.low,
         ci_high=estimate.high,
         iqm=float(iqm(values)),
-        success_rate=success_rate,
+        success_rate=float(np.mean([math.nan if success is None else success for success in successes])),
         n_seeds=len(groups[0]),
         n_episodes=len(values),
         **named,
@@ -90,7 +92,7 @@ def _row(groups: list[list[NDArray[np.float64]]], success_rate: float, **named: 
 
 
 def return_curve(method: Method) -> Curve | None:
-    """Return normalized returns over gradient steps, with their range over seeds; None without evaluated snapshots."""
+    """Return returns over gradient steps, with their range over seeds; None without evaluated snapshots."""
     if not all(map(snapshots, method.runs)):
         return None
     columns: list[dict[int, float]] = []
@@ -100,12 +102,14 @@ def return_curve(method: Method) -> Curve | None:
         for policy in (*snapshots(run), run):
             folder = evaluation_folder(policy, config)
             if (folder / "result.json").exists():
-                column[read_meta(policy)["n_updates"]] = float(read_evaluation(folder).normalized().mean())
+                evaluation = read_evaluation(folder)
+                column[read_meta(policy)["n_updates"]] = float(evaluation.returns().mean())
         columns.append(column)
     steps = sorted(set.intersection(*(set(column) for column in columns)))
     if len(steps) < 2:
         return None
-    return _curve(method.name, "normalized return, %", steps, [[column[step] for step in steps] for column in columns])
+    quantity = "normalized return, %" if method.evaluations()[0].is_normalized else "return"
+    return _curve(method.name, quantity, steps, [[column[step] for step in steps] for column in columns])
 
 
 def learning_curve(method: Method) -> Curve | None:
@@ -154,15 +158,21 @@ def compare_runs(runs: Sequence[Path], *, title: str, trust: bool = False) -> Re
     sources: set[str] = set()
     for run in runs:
         dataset = DatasetRecord.of_run(read_meta(run))
-        sources.add(dataset.id if dataset.relabel is None else dataset.relabel.source)
+        sources.add(dataset.source_id)
         if dataset.relabel is not None and exists(dataset.id):
             goal = goal_name(dataset.relabel)
             if goals.setdefault(goal, dataset.id) != dataset.id:
                 goals[f"{goal} ({dataset.id})"] = dataset.id
     source = sources.pop() if len(sources) == 1 else None
-    if trust and goals:
+    if trust and goals and _scorer_file(goals).exists():
         check_scorer(_scorer_file(goals), trust=True)
-    return compare(title, methods, source_id=source if source is not None and exists(source) else None, goals=goals)
+    known = source if source is not None and exists(source) and _has_truth(source) else None
+    return compare(title, methods, source_id=known, goals=goals)
+
+
+def _has_truth(dataset_id: str) -> bool:
+    with open_dataset(dataset_id) as ds:
+        return ds.has_truth
 
 
 def _scorer_file(goals: Mapping[str, str]) -> Path:
@@ -186,7 +196,7 @@ def compare(
     Args:
         title: of the page.
         methods: rows, in the order of the table.
-        source_id: the collected dataset, for the "Demo" row; None leaves the row out.
+        source_id: the dataset that was relabeled, for the "Demo" row, with ground truth; None leaves the row out.
         goals: name → relabeled dataset.
         paper_demo: the paper's figure for "Demo", in percent.
         caveats: sentences below the results.
@@ -194,10 +204,12 @@ def compare(
         film: makes the episodes' videos.
 
     Raises:
-        BadInput: a run was not evaluated, or is of another task than the others.
+        BadInput: a run was not evaluated, or is of another task than the others (outside the kitchen: of another
+            dataset).
     """
     metas = {str(run): read_meta(run) for method in methods for run in method.runs}
-    tasks = {str(DatasetRecord.of_run(meta).task) for meta in metas.values()}
+    records = [DatasetRecord.of_run(meta) for meta in metas.values()]
+    tasks = {record.task or record.source_id for record in records}
     if len(tasks) != 1:
         raise BadInput(f"a report compares runs of one task, got {', '.join(sorted(tasks))}; write one report per task")
     evaluations = {method.name: method.evaluations() for method in methods}
@@ -207,12 +219,13 @@ def compare(
     scatters, goal_panels = [], []
     for name, dataset_id in goals.items():
         with open_dataset(dataset_id) as ds:
-            scatters.append(goal_scatter(name, ds))
+            scatter = goal_scatter(name, ds) if ds.has_truth else None
+            scatters += [] if scatter is None else [scatter]
             if ds.record.relabel is not None:
-                goal_panels.append(goal_panel(name, ds.record.relabel, ds.path, scatters[-1]))
+                goal_panels.append(goal_panel(name, ds.record.relabel, ds.path, scatter))
     scorer = None
-    if goals:
-        scorer = StateScorer.load(_scorer_file(goals))
+    if goals and (file := _scorer_file(goals)).exists():
+        scorer = StateScorer.load(file)
     contenders = [method for method in methods if method.kind == "method"]
     episodes = [
         episode

@@ -180,7 +180,7 @@ def _rows(page: Report) -> dict[str, Any]:
             "normalized_return": row.mean,
             "ci95": [row.ci_low, row.ci_high],
             "iqm": row.iqm,
-            "success": row.success_rate,
+            "success": None if math.isnan(row.success_rate) else row.success_rate,
             "n_seeds": row.n_seeds,
             "n_episodes": row.n_episodes,
             "paper": row.paper_value,

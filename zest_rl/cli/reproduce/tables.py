@@ -15,7 +15,7 @@ def as_text(result: Mapping[str, Any]) -> str:
         low, high = row["ci95"]
         paper = "–" if row["paper"] is None else f"{row['paper']:.2f}"
         lines.append(
-            f"{name:<28}{row['normalized_return']:>12.2f}  {f'[{low:.2f}, {high:.2f}]':<18}{row['success']:>8.0%}"
+            f"{name:<28}{row['normalized_return']:>12.2f}  {f'[{low:.2f}, {high:.2f}]':<18}{_share(row):>8}"
             f"{row['n_seeds']:>7}{row['n_episodes']:>10}{paper:>8}"
         )
     if len(result["tasks"]) > 1:
@@ -48,10 +48,15 @@ def as_markdown(result: Mapping[str, Any], rows: Sequence[str] = ()) -> str:
     lines = [f"| | {' | '.join(columns)} |", "|---|" + "---|" * len(columns)]
     for name, row in shown.items():
         low, high = row["ci95"]
-        cells = [f"{row['normalized_return']:.2f}", f"{low:.1f} to {high:.1f}", f"{100 * row['success']:.0f} %"]
+        cells = [f"{row['normalized_return']:.2f}", f"{low:.1f} to {high:.1f}", _share(row)]
         cells += [f"{result['tasks'][task]['rows'][name]['normalized_return']:.1f}" for task in tasks]
         if with_seeds:
             cells.append("–" if row["kind"] == "dataset" else str(row["n_seeds"]))
         cells.append("–" if row["paper"] is None else f"{row['paper']:.2f}")
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def _share(row: Mapping[str, Any]) -> str:
+    """Write the share of successes; a dash where nothing tells them."""
+    return "–" if row["success"] is None else f"{100 * row['success']:.0f} %"
