@@ -227,6 +227,18 @@ def rewrite(path: Path, **changes: Any) -> None:
     safetensors.numpy.save_file(arrays, path, metadata={"scorer": json.dumps(described)})
 
 
+def test_a_scorer_of_before_sees_by_the_views_it_was_made_with(tmp_path: Path) -> None:
+    start = KitchenEnv("knob2").start_qpos
+    before = Views("knob2", n_views=2, size=96, framing=1)
+    scorer, path = build(start[None], before), tmp_path / "scorer.safetensors"
+    scorer.scorer.save(path)
+    rewrite(path, views={name: value for name, value in asdict(before).items() if name != "framing"})
+    loaded = Scorer.load(path)
+    assert loaded.views == before
+    assert loaded.record == scorer.scorer.record
+    assert len(before.cameras) == 2 != len(Views("knob2", n_views=2, size=96).cameras)
+
+
 def test_a_scorer_of_another_precision_or_other_views_is_refused(scorer: StateScorer, tmp_path: Path) -> None:
     path = tmp_path / "scorer.safetensors"
     scorer.scorer.save(path)

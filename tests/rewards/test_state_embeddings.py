@@ -24,7 +24,7 @@ from zest_rl.runtime.parallel import chunks, one_thread
 
 VIEWS = Views("micro", n_views=2, size=96)
 EMBEDDER = "efficientnet-lite0"
-MICROWAVE, ELBOW = 22, 3
+MICROWAVE, ELBOW, KNOB, BURNER = 22, 3, 11, 12
 """Places in qpos."""
 
 
@@ -72,6 +72,19 @@ def test_each_distinct_state_is_embedded_once_and_found_again_by_its_index() -> 
             frames = renderer.render(np.round(state / VIEWS.tolerance) * VIEWS.tolerance)
             alone = np.concatenate([load_embedder("efficientnet-lite0").embed_images([frame]) for frame in frames])
             np.testing.assert_allclose(row, alone, atol=1e-4)
+
+
+def test_states_that_differ_in_what_no_view_sees_have_the_bits_of_one() -> None:
+    states = np.tile(KitchenEnv("knob2").start_qpos, (4, 1))
+    states[:, KNOB] = [0, -0.1, -0.2, -0.2]
+    states[3, BURNER] = -0.009
+    together = single(Views("knob2", size=96)).embed_now(states)
+    assert together.shape == (4, 4, 1280)
+    np.testing.assert_array_equal(together[0], together[1])
+    np.testing.assert_array_equal(together[0], together[2])
+    assert (together[0] != together[3]).any()
+    alone = [single(Views("knob2", size=96)).embed_now(state[None])[0] for state in states]
+    np.testing.assert_array_equal(together, alone)
 
 
 def test_what_was_embedded_is_taken_from_the_cache_by_the_same_object_and_by_the_next() -> None:

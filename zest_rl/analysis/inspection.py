@@ -19,7 +19,7 @@ from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.metrics.reward_quality import returns_of
 from zest_rl.metrics.statistics import MIN_EPISODES_TO_RANK, Estimate
 from zest_rl.runtime.privacy import masked
-from zest_rl.runtime.records import from_json, reading_record
+from zest_rl.runtime.records import reading_record
 from zest_rl.types import FloatArray, GroundTruth
 
 
@@ -69,7 +69,7 @@ def inspect(dataset_id: str) -> Inspection:
                 f"rewards can be judged on at least {MIN_EPISODES_TO_RANK} episodes, {dataset_id} has {len(rewards)}"
             )
         with reading_record(ds.path / METADATA_FILE, "relabel the dataset again"):
-            views = None if record.scorer.views is None else from_json(Views, record.scorer.views)
+            views = None if record.scorer.views is None else Views.from_record(record.scorer.views)
         states = None if views is None else ds.states()
         truth = ds.truth() if ds.has_truth else None
     frames, still = None, None
@@ -150,6 +150,7 @@ def _settings(inspection: Inspection) -> dict[str, Any]:
         "features": scorer.features,
         "similarity": scorer.similarity,
         "views": record.n_views,
+        "framing": (scorer.views or {}).get("framing", 1),
         "share of goals": scorer.goal_share,
         "reward": record.reward,
         "shuffled": "no" if record.shuffle is None else record.shuffle,

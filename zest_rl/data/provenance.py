@@ -35,6 +35,7 @@ class ViewsRecord:
     size: int
     robot: bool
     tolerance: float
+    framing: int = 1
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ class RelabelRecord:
 
     @property
     def n_views(self) -> int:
-        """Number of views that scores were averaged over."""
+        """Number of views that scores were averaged over; in the kitchen of the whole ring."""
         return int(self.scorer.views["n_views"]) if self.scorer.views is not None else len((self.frames or {})["views"])
 
     def to_json(self) -> dict[str, Any]:

@@ -14,13 +14,14 @@ import importlib.metadata
 import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
 import mujoco
 import numpy as np
 
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.kitchen.tasks import TASKS, Task
+from zest_rl.kitchen.tasks import RING, TASKS, Task
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.gl import INSTALL_GL, select_gl_backend
 from zest_rl.simulation.rendering import Camera, StateRenderer
@@ -37,8 +38,10 @@ MAX_SIZE = 4096
 _RENDERER_VERSION = 1  # raise it when a pixel changes, here or in simulation/: cached embeddings depend on it
 _KITCHEN = Path("envs", "assets", "kitchen_franka")
 _ROBOT_ROOT = "panda0_link0"
-_AZIMUTHS = (60.0, 120.0)  # degrees; 90 looks from the robot's side straight at the kitchen
 _DISTANCES = (1.0, 0.7, 1.4)  # metres
+FRAMING = 2
+"""Version of the tasks' cameras; raise it when they change, and keep those of before."""
+_FRAMING_1: dict[str, dict[str, Any]] = {"knob2": {"lookat": (-0.22, 0.5, 2.12), "seen_from": RING}}
 
 
 @dataclass(frozen=True)
@@ -80,13 +83,25 @@ def relevant_qpos(config: RenderConfig) -> slice:
     return slice(0 if config.robot else N_ROBOT_QPOS, N_QPOS)
 
 
-def task_cameras(task: Task, n_views: int) -> tuple[Camera, ...]:
-    """Return a ring of views around the part that `task` moves, from 60 to 120 degrees.
+def task_cameras(task: Task, n_views: int, framing: int = FRAMING) -> tuple[Camera, ...]:
+    """Return a ring of views around the part that `task` moves, without those from which the scene hides it.
+
+    Args:
+        task: what is looked at.
+        n_views: of the whole ring, which spans `RING`.
+        framing: version of the cameras. 1 saw `knob2` from all sides, between its knob and the hidden burner.
 
     Raises:
-        BadInput: `n_views` is below 1.
+        BadInput: `n_views` is below 1, or there is no such framing.
     """
-    return ring(task.lookat, n_views, azimuths=_AZIMUTHS, distances=_DISTANCES, elevations=task.elevations)
+    if framing not in range(1, FRAMING + 1):
+        raise BadInput(f"the framing of the kitchen's views must be 1 to {FRAMING}, got {framing}; update zest-rl")
+    if framing == 1:
+        task = dataclasses.replace(task, **_FRAMING_1.get(task.name, {}))
+    around = functools.partial(ring, task.lookat, distances=_DISTANCES, elevations=task.elevations)
+    first, last = task.seen_from
+    seen = tuple(view for view in around(n_views, azimuths=RING) if first <= view.azimuth <= last)
+    return seen or around(1, azimuths=task.seen_from)
 
 
 def open_renderer(config: RenderConfig, cameras: tuple[Camera, ...]) -> StateRenderer:

@@ -5,16 +5,26 @@ With the robot hidden a frame depends on the objects' joints alone, so many stat
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.errors import BadInput
-from zest_rl.kitchen.scene import N_QPOS, RenderConfig, open_renderer, relevant_qpos, shared_renderer, task_cameras
+from zest_rl.kitchen.scene import (
+    FRAMING,
+    N_QPOS,
+    RenderConfig,
+    open_renderer,
+    relevant_qpos,
+    shared_renderer,
+    task_cameras,
+)
 from zest_rl.kitchen.tasks import Task, get_task
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.records import from_json
 from zest_rl.simulation.rendering import Camera, StateRenderer
 from zest_rl.simulation.views import each_once, on_grid
 
@@ -25,17 +35,25 @@ class Views:
 
     task: str
     n_views: int = 8
+    """Of the whole ring, of which those are left out from which the scene hides the object."""
     size: int = 224
     """Side of the square frames, in pixels."""
     robot: bool = False
     """Show the robot (the paper removes it from view)."""
     tolerance: float = 1e-3
     """Grid on which joint positions are rounded, in rad or m; 0: no rounding."""
+    framing: int = FRAMING
+    """Version of the tasks' cameras, see `task_cameras`; records of before name none, which is 1."""
 
     def __post_init__(self) -> None:
         _ = self.render_config, self.cameras  # each checks itself
         if not 0 <= self.tolerance < np.inf:
             raise BadInput(f"tolerance must be a finite number >= 0 (rad or m), got {self.tolerance}")
+
+    @classmethod
+    def from_record(cls, values: Mapping[str, Any]) -> Self:
+        """Read views as a dataset's metadata and a scorer's file hold them; raises as `from_json`."""
+        return from_json(cls, {"framing": 1, **values})
 
     @property
     def render_config(self) -> RenderConfig:
@@ -45,7 +63,12 @@ class Views:
     @property
     def cameras(self) -> tuple[Camera, ...]:
         """The ring of views."""
-        return task_cameras(get_task(self.task), self.n_views)
+        return task_cameras(get_task(self.task), self.n_views, self.framing)
+
+    @property
+    def n_drawn(self) -> int:
+        """Number of cameras, without those that are left out."""
+        return len(self.cameras)
 
     def fingerprint(self) -> str:
         """Hash of everything that a frame depends on besides the state."""

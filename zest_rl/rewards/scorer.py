@@ -269,14 +269,14 @@ def _read(path: Path) -> tuple[ScorerConfig, Views | SceneViews | None, ScorerRe
                 or not np.isfinite(array).all()
             ):
                 raise ValueError(f"{array.dtype} embeddings of shape {array.shape}, or not finite")
-        n_views = starts.shape[:-2] if views is None else (views.n_views,)[: starts.ndim - 2]
+        n_views = starts.shape[:-2] if views is None else (views.n_drawn,)[: starts.ndim - 2]
         if not (starts.shape[:-2] == goals.shape[:-2] == n_views and starts.shape[-1] == goals.shape[-1]):
             raise ValueError(f"starts of shape {starts.shape} beside goals of shape {goals.shape}")
         return config, views, ScorerRecord.from_json(described), starts, goals
 
 
 def _read_views(values: Mapping[str, Any]) -> Views | SceneViews:
-    return SceneViews.from_json(values) if "env_spec" in values else from_json(Views, values)
+    return SceneViews.from_json(values) if "env_spec" in values else Views.from_record(values)
 
 
 def embed_goal_cached(goal: GoalSpec, embedder: Embedder) -> tuple[FloatArray, FloatArray]:

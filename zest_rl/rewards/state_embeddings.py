@@ -4,7 +4,8 @@ The cache is a folder of shards ``keys (n, width) float64, embeddings (n, V, D) 
 everything that an embedding depends on. Any process may add shards; each is written atomically and never changed.
 
 One state is one batch of V frames on one thread, so that its embedding does not depend on the states embedded with it:
-networks are exact only up to about 1e-6 across batch sizes and thread counts.
+networks are exact only up to about 1e-6 across batch sizes and thread counts. States of equal frames that come together
+are embedded once.
 
 A digest tells a damaged shard from a whole one, which holds what another process computed, perhaps with another GL
 driver. So the first time that embeddings of recorded states are taken from the cache, and at the first new state of a
@@ -48,9 +49,15 @@ class _Job:
 
 def _embed_states(job: _Job) -> dict[str, NDArray[np.generic]]:
     embedder = job.embedder.load()
+    embeddings: dict[str, FloatArray] = {}  # by frames, which are equal where states differ in what no view sees
+    rows = []
     with one_thread():
-        embeddings = [embedder.embed_images(list(job.views.render(state))) for state in job.states]
-    return {"keys": job.states, "embeddings": np.stack(embeddings)}
+        for state in job.states:
+            frames = job.views.render(state)
+            if (digest := artifacts.hash_arrays(*frames)) not in embeddings:
+                embeddings[digest] = embedder.embed_images(list(frames))
+            rows.append(embeddings[digest])
+    return {"keys": job.states, "embeddings": np.stack(rows)}
 
 
 @functools.lru_cache(maxsize=SHARDS_IN_MEMORY)
@@ -81,7 +88,7 @@ class StateEmbedder:
         """States that were not in the cache."""
         digest = artifacts.hash_json([views.fingerprint(), network.fingerprint])
         self.folder: Path = cache_folder("embeddings", digest[:20])
-        self._form = (views.n_views, network.dim)
+        self._form = (views.n_drawn, network.dim)
         self._where: dict[bytes, tuple[Path, int]] = {}
         """State → its shard, and the row in it."""
         self._new: dict[bytes, FloatArray] = {}
@@ -169,16 +176,17 @@ class StateEmbedder:
 
     def embed_now(self, states: NDArray[np.float64]) -> FloatArray:
         """Embed states in this process, for use within a rollout: (N, width) → (N, V, D). Call `flush` at the end."""
-        rendered = self.views.canonical(states)
-        rows = []
-        for state, key in zip(rendered, state_keys(rendered), strict=True):
-            if (row := self._row(key)) is None:
-                self._check(self._where)
-                job = _Job(self.views, self.embedder, state[None])
-                self._new[key] = row = np.asarray(_embed_states(job)["embeddings"][0], np.float32)
-                self.n_embedded += 1
-            rows.append(row)
-        return np.stack(rows)
+        keys = state_keys(self.views.canonical(states))
+        rows = {key: row for key in dict.fromkeys(keys) if (row := self._row(key)) is not None}
+        if missing := [key for key in dict.fromkeys(keys) if key not in rows]:
+            self._check(self._where)
+            rendered = np.stack([np.frombuffer(key) for key in missing])
+            embeddings = _embed_states(_Job(self.views, self.embedder, rendered))["embeddings"]
+            new = dict(zip(missing, np.asarray(embeddings, np.float32), strict=True))
+            self.n_embedded += len(new)
+            self._new.update(new)
+            rows.update(new)
+        return np.stack([rows[key] for key in keys])
 
     def flush(self) -> None:
         """Write the results of `embed_now` to the cache."""

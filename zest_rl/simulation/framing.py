@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.simulation.bodies import Bodies, subtree
-from zest_rl.simulation.rendering import Camera
+from zest_rl.simulation.rendering import Camera, Canvas
 from zest_rl.simulation.views import ring
 
 HIDDEN_GROUP = 5
@@ -62,8 +62,29 @@ class ObjectRing:
         while len(shares) < len(lifted) and not (shares and (shares[-1] >= _SEEN).mean() >= 0.5):
             shares.append(seen_shares(lifted[len(shares)]))
         best = int(np.argmax([share.mean() for share in shares]))
-        hidden = shares[best] < _SEEN * shares[best].max()
-        return replace(lifted[best], dropped=tuple(np.flatnonzero(hidden).tolist()))
+        return replace(lifted[best], dropped=hidden_views(shares[best]))
+
+
+def hidden_views(shares: NDArray[np.float64]) -> tuple[int, ...]:
+    """Return the views from which the scene hides an object: that see less than half of what the best view sees.
+
+    Args:
+        shares: (V,) the share of the object that each view sees, of what it would see of the object alone.
+    """
+    return tuple(np.flatnonzero(shares < _SEEN * shares.max()).tolist())
+
+
+def seen_shares(
+    canvas: Canvas, model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """Return which share of some geoms each camera sees, of what it would see of them alone: (V,) in [0, 1].
+
+    1 where they are out of sight for other reasons. Afterwards the model's other geoms are hidden (`HIDDEN_GROUP`).
+    """
+    in_scene = np.isin(canvas.segments(data), geoms).sum(axis=(1, 2))
+    model.geom_group[np.setdiff1d(np.arange(model.ngeom), geoms)] = HIDDEN_GROUP
+    alone = np.isin(canvas.segments(data), geoms).sum(axis=(1, 2))
+    return np.where(alone > 0, in_scene / np.maximum(alone, 1), 1.0)
 
 
 def drawn_geoms(model: mujoco.MjModel, bodies: Bodies) -> NDArray[np.intp]:

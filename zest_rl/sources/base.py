@@ -48,8 +48,8 @@ class StateViews(Protocol):
     """
 
     @property
-    def n_views(self) -> int:
-        """V."""
+    def n_drawn(self) -> int:
+        """V, without views that are left out."""
 
     @property
     def width(self) -> int:

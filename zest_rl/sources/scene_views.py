@@ -20,7 +20,7 @@ from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.records import from_json
 from zest_rl.simulation.bodies import Bodies, robot_bodies
-from zest_rl.simulation.framing import HIDDEN_GROUP, ObjectRing, Point, centre, object_geoms
+from zest_rl.simulation.framing import HIDDEN_GROUP, ObjectRing, Point, centre, object_geoms, seen_shares
 from zest_rl.simulation.rendering import Camera
 from zest_rl.simulation.views import on_grid
 from zest_rl.sources.recorded_envs import Doubles, State, running_state
@@ -56,16 +56,10 @@ class SceneStage:
         return list(self._canvas.draw(self.simulation.data))
 
     def seen_shares(self, state: State, cameras: Sequence[Camera], body: int) -> NDArray[np.float64]:
-        """Return which share of a body each camera sees, of what it would see of the body alone: (V,) in [0, 1].
-
-        1 where the body is out of sight for other reasons.
-        """
+        """Return which share of a body each camera sees: (V,) in [0, 1]; see `framing.seen_shares`."""
         self._place(state, cameras)
-        model, geoms = self.simulation.model, object_geoms(self.simulation.model, body)
-        in_scene = np.isin(self._canvas.segments(self.simulation.data), geoms).sum(axis=(1, 2))
-        model.geom_group[np.setdiff1d(np.arange(model.ngeom), geoms)] = HIDDEN_GROUP
-        alone = np.isin(self._canvas.segments(self.simulation.data), geoms).sum(axis=(1, 2))
-        return np.where(alone > 0, in_scene / np.maximum(alone, 1), 1.0)
+        model, data = self.simulation.model, self.simulation.data
+        return seen_shares(self._canvas, model, data, object_geoms(model, body))
 
     def _place(self, state: State, cameras: Sequence[Camera]) -> None:
         self.simulation.put(state)
@@ -132,8 +126,8 @@ class SceneViews:
         return from_json(cls, {**values, "ring": from_json(ObjectRing, values["ring"])})
 
     @property
-    def n_views(self) -> int:
-        """Number of cameras."""
+    def n_drawn(self) -> int:
+        """Number of cameras, without those that are left out."""
         return self.ring.n_views - len(self.ring.dropped)
 
     @property
