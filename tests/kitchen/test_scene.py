@@ -135,7 +135,8 @@ def test_every_view_of_a_task_shows_its_part_moving(
         if knob == physics.joint(task.joint).id:
             risen = moved[physics.jnt_qposadr[burner]]
             np.testing.assert_allclose(physics.eq_data[equality, 1] * risen, task.goal, rtol=1e-9)
-    assert (change.mean(axis=(1, 2)) > 0.0003).all(), "share of pixels that change, per view"
+    enough = 0.0003 if task.name == "knob2" else 0.001  # of the burner a kettle leaves a sliver
+    assert (change.mean(axis=(1, 2)) > enough).all(), "share of pixels that change, per view"
     assert not change[:, 0].any(), "the moving part stays below the upper edge"
 
 

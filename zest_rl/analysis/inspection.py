@@ -150,7 +150,6 @@ def _settings(inspection: Inspection) -> dict[str, Any]:
         "features": scorer.features,
         "similarity": scorer.similarity,
         "views": record.n_views,
-        "framing": (scorer.views or {}).get("framing", 1),
         "share of goals": scorer.goal_share,
         "reward": record.reward,
         "shuffled": "no" if record.shuffle is None else record.shuffle,
