@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from recorded_robots import record
 
@@ -50,3 +51,10 @@ def test_an_environment_goes_from_a_recording_to_a_report(env_id: str, zest: Run
     assert evaluated["videos"].keys() == {"best", "median", "worst"}
     result = artifacts.read_json(Path(evaluated["result"]))
     assert all(episode["zest_return"] is not None for episode in result["episodes"]), "it was scored online"
+    reported = zest("report", trained["run"], "--output", tmp_path / "report.html")
+    assert reported["rows"].keys() == {"Demo", "RVS on episode:0"}
+    assert np.isfinite(list(reported["rows"].values())).all()
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "Returns are sums of the environment's own rewards" in page
+    assert "ormalized return" not in page
+    assert page.count("<video") == 3

@@ -65,12 +65,12 @@ class RunEnvironment:
     @property
     def is_kitchen(self) -> bool:
         """Whether it is zest/Kitchen-v1, whose episodes all last until the horizon."""
-        return self.success_key == "gt/success"
+        return self.success_key == "gt/success" and MAKER.fullmatch(self.made_by) is None
 
     @property
     def name(self) -> str:
         """Id of the environment, or the function that makes it."""
-        return _name(self.made_by)
+        return ENV_ID if self.is_kitchen else _name(self.made_by)
 
     def make(self) -> gymnasium.Env[Any, Any]:
         """Make one; raises as `_make`."""
@@ -238,7 +238,7 @@ def _probed(made_by: str, meta: Mapping[str, Any], horizon: int | None, success_
     steps = horizon or own_horizon or longest
     if type(steps) is not int or not 1 <= steps <= MAX_HORIZON:
         raise BadInput(f"{name} must have a horizon of 1 to {MAX_HORIZON} steps, got {steps}; give --horizon N")
-    scenery = recorded_env(str(_entry_point(made_by))).scenery(bare)
+    scenery = recorded_env(_entry_point(made_by), bare).scenery(bare)
     changed = [field for field, values in compiled.items() if not np.array_equal(values, after_reset[field])]
     placed = [path.rpartition("/")[2] for path in scenery] or changed
     fields = ("qpos", *placed, *DATA_FIELDS[1:])

@@ -93,9 +93,9 @@ def _image(style: str, label: str, parts: Iterable[str], **data: object) -> Mark
 
 
 def results_axis(rows: Sequence[MethodRow]) -> Axis:
-    """Return the axis that the bars of a table share; it holds 0 % and 100 %."""
+    """Return the axis that the bars of a table share; it holds 0 % and 100 % where returns are normalized."""
     values = [v for row in rows for v in (row.mean, row.ci_low, row.ci_high, row.paper_value) if v is not None]
-    return axis_over([0, 100, *values], 5, 0.02)
+    return axis_over([*((0, 100) if all(row.is_normalized for row in rows) else ()), *values], 5, 0.02)
 
 
 def interval_bar(row: MethodRow, axis: Axis) -> Markup:
@@ -107,7 +107,9 @@ def interval_bar(row: MethodRow, axis: Axis) -> Markup:
         parts.append(f'<line class="ci" x1="{low:.2f}%" x2="{high:.2f}%" y1="50%" y2="50%"/>')
     if math.isfinite(row.mean):
         parts.append(f'<circle class="mean" cx="{axis.percent(row.mean):.2f}%" cy="50%" r="5"/>')
-    label = f"mean {number(row.mean, 1)} %, 95 % interval {number(row.ci_low, 1)} to {number(row.ci_high, 1)} %"
+    unit, digits = (" %", 1) if row.is_normalized else ("", 2)
+    mean, lowest, highest = (number(value, digits) for value in (row.mean, row.ci_low, row.ci_high))
+    label = f"mean {mean}{unit}, 95 % interval {lowest} to {highest}{unit}"
     if row.paper_value is not None and math.isfinite(row.paper_value):
         at = f"{axis.percent(row.paper_value):.2f}%"
         parts.append(f'<svg x="{at}" y="50%" overflow="visible"><path class="paper" d="M0 7l5 5l-5 5l-5-5Z"/></svg>')

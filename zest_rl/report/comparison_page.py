@@ -53,17 +53,22 @@ def method_row(method: Method, *tasks: Sequence[Evaluation]) -> MethodRow:
         kind=method.kind,
         note=method.note,
         paper_value=method.paper,
+        is_normalized=all(evaluation.is_normalized for evaluations in tasks for evaluation in evaluations),
     )
 
 
 def dataset_row(*dataset_ids: str, paper: float | None = None) -> MethodRow:
     """Summarise the datasets themselves, one per task (the paper's "Demo")."""
-    groups, successes = [], list[bool | None]()
+    groups, successes, is_normalized = [], list[bool | None](), True
     for dataset_id in dataset_ids:
         with open_dataset(dataset_id) as ds:
             record, truth = ds.record, ds.truth()
         returns, minimum, expert = true_returns(truth), record.ref_min_score, record.ref_max_score
-        groups.append([returns if minimum is None or expert is None else normalized_return(returns, minimum, expert)])
+        if minimum is None or expert is None:
+            is_normalized = False
+        else:
+            returns = normalized_return(returns, minimum, expert)
+        groups.append([returns])
         successes += [episode.success for episode in truth]
     return _row(
         groups,
@@ -72,6 +77,7 @@ def dataset_row(*dataset_ids: str, paper: float | None = None) -> MethodRow:
         kind="dataset",
         note="the dataset's own episodes",
         paper_value=paper,
+        is_normalized=is_normalized,
     )
 
 
@@ -224,8 +230,8 @@ def compare(
             if ds.record.relabel is not None:
                 goal_panels.append(goal_panel(name, ds.record.relabel, ds.path, scatter))
     scorer = None
-    if goals and (file := _scorer_file(goals)).exists():
-        scorer = StateScorer.load(file)
+    if goals and records[0].task is not None and (file := _scorer_file(goals)).exists():
+        scorer = StateScorer.load(file)  # elsewhere the scores of the rollouts are shown
     contenders = [method for method in methods if method.kind == "method"]
     episodes = [
         episode
@@ -300,12 +306,18 @@ def overview(
 
 
 def _unequal_starts(evaluations: dict[str, list[Evaluation]]) -> list[str]:
-    """Return a sentence if the methods were evaluated on different starts."""
+    """Return a sentence if the methods were evaluated on different starts, or in different environments."""
+    horizons = {(each.environment.name, each.environment.horizon) for group in evaluations.values() for each in group}
+    sentences = []
+    if len(horizons) > 1:
+        listed = ", ".join(f"{name} for {steps} steps" for name, steps in sorted(horizons))
+        sentences = [f"The methods were not evaluated in one environment of one horizon ({listed})."]
     starts = {name: {evaluation.config.starts for evaluation in group} for name, group in evaluations.items()}
     if len(set().union(*starts.values())) == 1:
-        return []
+        return sentences
     listed = "; ".join(
         f"{name}: {' and '.join(sorted(f'{len(seeds)} from seed {seeds.start}' for seeds in group))}"
         for name, group in starts.items()
     )
-    return [f"The methods were not evaluated on the same starts, so their numbers are not paired ({listed})."]
+    unpaired = f"The methods were not evaluated on the same starts, so their numbers are not paired ({listed})."
+    return [*sentences, unpaired]

@@ -1,7 +1,7 @@
 """The items of a report's sections: frozen dataclasses, checked where they are built.
 
-Returns are normalized: 100 % is the expert, 0 % is a robot that does nothing. A figure that could not be computed is
-NaN and is displayed as "–".
+Returns are normalized, 100 % is the expert, 0 % is a robot that does nothing; or, where an item says so, sums of the
+environment's own rewards. A figure that could not be computed is NaN and is displayed as "–".
 """
 
 from __future__ import annotations
@@ -50,6 +50,8 @@ class MethodRow:
     note: str = ""
     paper_value: float | None = None
     """The paper's mean normalized return, in %; None when the paper has no such figure."""
+    is_normalized: bool = True
+    """Whether returns are in %; else they are sums of rewards."""
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(Kind):

@@ -21,6 +21,8 @@ def headline(rows: Sequence[MethodRow], metas: Mapping[str, Mapping[str, Any]], 
         n_datasets: over which the results are.
     """
     contenders = [row for row in rows if row.kind == "method"]
+    if not all(row.is_normalized for row in rows):
+        return _best_return(contenders)
     data = next((row for row in rows if row.kind == "dataset"), None)
     clone = next((row for row in contenders if _clones_all(metas[row.method])), None)
     givers = {row.method: _giver(metas[row.method]) for row in contenders}
@@ -38,6 +40,16 @@ def headline(rows: Sequence[MethodRow], metas: Mapping[str, Mapping[str, Any]], 
         )
     doubt = "" if best.ci_low > clone.ci_high else "; as these overlap, the difference may be chance"
     return f"{trained} and {best.method}, which {rewards}, {best.mean:.0f} % {intervals}{doubt}."
+
+
+def _best_return(contenders: Sequence[MethodRow]) -> str:
+    best = max(contenders, key=lambda row: row.mean, default=None)
+    if best is None:
+        return ""
+    return (
+        f"{best.method} has the highest mean return, {best.mean:.2f} (95 % interval {best.ci_low:.2f} to "
+        f"{best.ci_high:.2f}, {best.n_episodes} episodes); the dataset has no reference scores to normalize it by."
+    )
 
 
 def _interval(row: MethodRow) -> str:

@@ -49,6 +49,7 @@ def render_html(report: Report) -> str:
     environment.filters |= {
         "number": number,
         "percent": _percent,
+        "returned": lambda value, is_normalized: _percent(value) if is_normalized else number(value),
         "counted": _counted,
         "png": _png,
         "mp4": _mp4,

@@ -91,8 +91,9 @@ def goal_name(relabel: RelabelRecord) -> str:
 def _short_name(meta: dict[str, Any]) -> str:
     if meta["agent"] == FOREIGN:
         return str(meta["name"])
-    agent, relabel = str(meta["agent"]).upper(), DatasetRecord.of_run(meta).relabel
-    return agent if agent == "BC" else f"{agent} on {'ground truth' if relabel is None else goal_name(relabel)}"
+    agent, dataset = str(meta["agent"]).upper(), DatasetRecord.of_run(meta)
+    own = "ground truth" if dataset.task is not None else "its own rewards"
+    return agent if agent == "BC" else f"{agent} on {own if dataset.relabel is None else goal_name(dataset.relabel)}"
 
 
 def latest_evaluation(run: Path) -> Evaluation:

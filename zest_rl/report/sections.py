@@ -73,7 +73,7 @@ class Report:
 RESULTS = SectionKind[MethodRow](
     "Results",
     "results.html",
-    "100 % is the expert, 0 % is the robot that does nothing. Lines are 95 % bootstrap intervals.",
+    "Lines are 95 % bootstrap intervals.",
 )
 TASK_TABLES = SectionKind[TaskTable](
     "Tasks",

@@ -131,6 +131,8 @@ RECORDED_ENVS = (
 """The first row whose prefix matches counts. Apart from noise, the columns hold qpos exactly."""
 
 
-def recorded_env(entry_point: str) -> RecordedEnv:
-    """Return the row of an environment, or a default one."""
-    return next((row for row in RECORDED_ENVS if entry_point.startswith(row.prefix)), RecordedEnv(entry_point))
+def recorded_env(entry_point: str, env: Any) -> RecordedEnv:
+    """Return the row of an environment (without its wrappers) or of what its class extends; else a default one."""
+    names = [entry_point, *(f"{base.__module__}:{base.__qualname__}" for base in type(env).__mro__)]
+    rows = (row for name in names for row in RECORDED_ENVS if name.startswith(row.prefix))
+    return next(rows, RecordedEnv(entry_point))

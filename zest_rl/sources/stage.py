@@ -64,7 +64,7 @@ class Simulation:
             for owner, names in ((self.model, MODEL_FIELDS), (self.data, DATA_FIELDS))
             for name in names
         ]
-        self.entry_point, self.recorded = entry_point, recorded_env(entry_point)
+        self.entry_point, self.recorded = entry_point, recorded_env(entry_point, env)
 
     def put(self, state: State) -> None:
         """Restore a recorded state, and compute positions in the world; what it lacks is as the environment made it."""
