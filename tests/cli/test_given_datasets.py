@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -91,7 +92,7 @@ title = "Given"
 
 [tasks.push]
 dataset = "given/push-v0"
-horizon = 5
+horizon = 4
 relabel = { show_robot = true, look_at = "robot0:gripper_link" }
 
 [relabel]
@@ -125,7 +126,10 @@ kind = "control"
 
 
 def test_methods_are_compared_on_a_dataset_of_another_robot(
-    tmp_path: Path, zest: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    zest: Callable[..., dict[str, Any]],
+    refusal: Callable[..., tuple[int, str]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
@@ -136,8 +140,13 @@ def test_methods_are_compared_on_a_dataset_of_another_robot(
         env.reset(seed=seed)
         for _ in range(4):
             env.step(env.action_space.sample())
-    env.write("given/push-v0", ref_min_score=-10.0, ref_max_score=0.0)
     words = ["reproduce", write(tmp_path, PUSH), "--output", tmp_path / "out", "--n-workers", "1"]
+    path = env.write("given/push-v0")
+    assert "given/push-v0 lacks ref_min_score or ref_max_score" in refusal(*words)[1]
+    shutil.rmtree(path)
+    env.write("given/push-v0", ref_min_score=-10.0, ref_max_score=0.0)
+    other = write(tmp_path / "minari", PUSH.replace("horizon = 4", "horizon = 50"))
+    assert "horizon must be that of given/push-v0, 4 steps" in refusal("reproduce", other, *words[2:])[1]
     result = zest(*words)
     assert {name: (row["kind"], row["n_episodes"]) for name, row in result["rows"].items()} == {
         "Demo": ("dataset", 3),
@@ -146,7 +155,7 @@ def test_methods_are_compared_on_a_dataset_of_another_robot(
         "GT-reward RvS": ("control", 2),
     }
     assert result["rows"]["Demo"]["normalized_return"] == pytest.approx(60), "-4 of -10 to 0"
-    assert result["rows"]["BC"]["normalized_return"] == pytest.approx(50), "5 steps, as the recipe says"
+    assert result["rows"]["BC"]["normalized_return"] == pytest.approx(60), "4 steps, as the recipe says, and not 50"
     assert result["rows"]["BC"]["success"] == 0
     assert result["tasks"]["push"]["dataset"] == {"dataset": "given/push-v0"}
     assert list(result["seconds_by_stage"]) == ["relabel", "train and evaluate", "report"], "nothing is collected"

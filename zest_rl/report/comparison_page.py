@@ -170,7 +170,7 @@ def compare_runs(runs: Sequence[Path], *, title: str, trust: bool = False) -> Re
             if goals.setdefault(goal, dataset.id) != dataset.id:
                 goals[f"{goal} ({dataset.id})"] = dataset.id
     source = sources.pop() if len(sources) == 1 else None
-    if trust and goals and _scorer_file(goals).exists():
+    if trust and goals and DatasetRecord.of_run(read_meta(runs[0])).task is not None:
         check_scorer(_scorer_file(goals), trust=True)
     known = source if source is not None and exists(source) and _has_truth(source) else None
     return compare(title, methods, source_id=known, goals=goals)

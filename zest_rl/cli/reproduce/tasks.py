@@ -57,7 +57,8 @@ def read_given(tasks: Mapping[str, Mapping[str, Any]], where: str) -> dict[str, 
 
 
 def check_given(given: Mapping[str, GivenDataset], where: str) -> None:
-    """Check that the datasets are there, with equally many episodes.
+    """Check that the datasets are there, with equally many episodes, and both ends of the normalized return, over as
+    many steps as are asked for.
 
     Raises:
         BadInput: they are not; all that are missing are named, with the commands that make them.
@@ -72,7 +73,17 @@ def check_given(given: Mapping[str, GivenDataset], where: str) -> None:
     sizes = {}
     for name, task in given.items():
         with open_dataset(task.dataset) as ds:
-            sizes[name] = len(ds.n_steps())
+            sizes[name], longest, record = len(ds.n_steps()), max(ds.n_steps()), ds.record
+        if record.ref_min_score is None or record.ref_max_score is None:
+            raise BadInput(
+                f"{where} [tasks.{name}]: {task.dataset} lacks ref_min_score or ref_max_score, the returns that are 0 "
+                "and 100 % of the expert; give both when it is made (Recorder.write), or compare with `zest report`"
+            )
+        if task.horizon not in (None, longest):
+            raise BadInput(
+                f"{where} [tasks.{name}]: horizon must be that of {task.dataset}, {longest} steps, over which its "
+                f"reference scores are, got {task.horizon}"
+            )
     if len(set(sizes.values())) > 1:
         raise BadInput(f"{where} [tasks]: every task needs as many episodes, got {sizes}")
 
