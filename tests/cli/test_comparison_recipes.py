@@ -23,6 +23,11 @@ def test_one_task_may_have_several_datasets(tmp_path: Path) -> None:
     }
 
 
+def test_a_goal_may_be_the_ends_of_an_episode_of_the_kitchen(tmp_path: Path) -> None:
+    comparison = read_comparison(write(tmp_path, RECIPE.replace("same-scene", "episode:3")))
+    assert comparison.relabel["micro"]["scene"].goal == "episode:3"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [

@@ -62,6 +62,7 @@ def test_the_goal_and_the_environment_may_be_those_of_each_task(tmp_path: Path) 
         ("made_by", "made-bye", "[tasks.push]: unknown key 'made-bye'; did you mean 'made-by'"),
         ("[tasks.door]", "[tasks.report]", "[tasks.'report']: the name becomes a file's beside report.html"),
         ("views = 2", 'dataset = "a/b-v0"', "'dataset' is not for a recipe to set"),
+        ("views = 2", 'preview = "look.png"', "'preview' is not for a recipe to set"),
         ("[goals.words]", "[collect]\n[goals.words]", "[tasks.push]: unknown key 'made_by'"),
         ('"text:far -> near"', '"visual-tasks:real_imgs/open_cabinet"', "set it to your copy of the Visual Tasks"),
         (TWO[TWO.index("[tasks.push]") : TWO.index("[relabel]")], "", "names no data: give it a table [collect]"),

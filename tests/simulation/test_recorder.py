@@ -81,3 +81,10 @@ def test_what_cannot_be_recorded_is_refused() -> None:
         Recorder(gymnasium.make("CartPole-v1"))
     with pytest.raises(BadInput, match="at least 1 episode with a step, got none"):
         Recorder(gymnasium.make("FetchPush-v4")).write("push/none-v0")
+
+
+@pytest.mark.parametrize("references", [{"ref_min_score": 0.0}, {"ref_min_score": 0.0, "ref_max_score": -50.0}])
+def test_reference_scores_that_are_no_scale_are_refused(references: dict[str, float]) -> None:
+    env, _ = record("FetchPush-v4", (1,))
+    with pytest.raises(BadInput, match="two finite numbers, that of 0 % below that of 100 %, or none, got ref_min_"):
+        env.write("push/none-v0", **references)

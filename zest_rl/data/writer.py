@@ -5,6 +5,7 @@ The layout on disk is drawn in `zest_rl.data.reader`, the alignment of the array
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import warnings
@@ -225,12 +226,17 @@ def write_episodes(
         The dataset's folder.
 
     Raises:
-        BadInput: bad id, or a dataset of this id exists.
+        BadInput: bad id, a dataset of this id exists, or one reference score without or not below the other.
         ZestError: the disk is full or read-only; nothing is left behind.
     """
     fields = {"observation_space": observation_space, "action_space": action_space, "description": description}
     references = {"ref_min_score": ref_min_score, "ref_max_score": ref_max_score}
     given = {name: score for name, score in references.items() if score is not None}
+    if given and not (len(given) == 2 and -math.inf < given["ref_min_score"] < given["ref_max_score"] < math.inf):
+        raise BadInput(
+            "reference scores must be two finite numbers, that of 0 % below that of 100 %, or none, got ref_min_score "
+            f"{ref_min_score} and ref_max_score {ref_max_score}"
+        )
     arrays = [_flat({name: part for name, part in episode.items() if name != "seed"}) for episode in episodes]
     n_bytes = sum(array.nbytes for of_episode in arrays for array in of_episode.values())
     with _staged(dataset_id, 2 * n_bytes) as staging:

@@ -151,13 +151,15 @@ def _read_goals(tables: ComparisonTables, task: Any, recipe: str) -> dict[str, A
     for name, goal in tables.goals.items():
         where, flags = f"{recipe} [goals.{name!r}]", dict[str, Any]()
         for given in (tables.relabel, of_task, goal):
-            flags |= checked_table(given, where, "dataset")
-        goals[name] = load_config(relabel.Config, {**flags, "dataset": ""}, where)
+            flags |= checked_table(given, where, "dataset", "preview")
+        config = goals[name] = load_config(relabel.Config, {**flags, "dataset": ""}, where)
         with located(where):
-            if not isinstance(task, GivenDataset):
-                goal_folder(goals[name].goal, get_task(task.task))
-            elif not goals[name].goal.startswith(EPISODE):
-                free_goal_folder(goals[name].goal)
+            if config.goal.startswith(EPISODE):
+                continue
+            if isinstance(task, GivenDataset):
+                free_goal_folder(config.goal)
+            else:
+                goal_folder(config.goal, get_task(task.task))
     return goals
 
 
