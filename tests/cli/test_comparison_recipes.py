@@ -62,6 +62,7 @@ def test_a_goal_may_be_the_ends_of_an_episode_of_the_kitchen(tmp_path: Path) -> 
         ("context_len = 5", "contextlen = 5", "unknown key 'contextlen'; did you mean 'context-len'"),
         ("context_len = 5", 'dataset = "zest/x-v0"', "'dataset' is not for a recipe to set"),
         ('"dt"\ngoal = "scene"', '"dt"\ngoal = "sceen"', "unknown goal 'sceen'; did you mean 'scene'"),
+        ("n_episodes = 2", "horizon = 50", "[methods.'BC']: 'horizon' is not for a recipe to set"),
         ("n_episodes = 2", "n_episodes = 0", "n_episodes must be at least 1, got 0"),
         ("n_episodes = 2", 'rtg = "offline"', "'rtg' must be one of 'online', 'constant', 'schedule', got 'offline'"),
         ('agent = "bc"', 'agent = "bc"\npolicy = "onnx:x"', "either an agent or a policy, got 'bc' and 'onnx:x'"),

@@ -50,9 +50,9 @@ def test_the_goal_and_the_environment_may_be_those_of_each_task(tmp_path: Path) 
     assert (push["words"].goal, push["words"].views, push["words"].env) == ("text:far -> near", 2, None)
     assert (door["words"].goal, door["words"].views, door["words"].env) == ("text:shut -> open", 3, "my_robot:door")
     assert (push["shuffled"].goal, push["shuffled"].shuffle) == ("text:closed -> open", 0), "what a goal says wins"
-    asked = ("env", "horizon", "success_key")
+    asked = {"env": "my_robot:door", "horizon": 50, "success_key": "open"}
+    assert comparison.tasks["door"].arguments(*asked) == asked
     assert comparison.tasks["push"].arguments(*asked) == {}
-    assert comparison.tasks["door"].arguments(*asked) == {"env": "my_robot:door", "horizon": 50, "success_key": "open"}
 
 
 @pytest.mark.parametrize(

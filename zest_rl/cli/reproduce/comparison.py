@@ -198,7 +198,9 @@ def _read_method(tables: ComparisonTables, method: Mapping[str, Any], where: str
         for given in (shared, by_agent.get(table.agent_or_foreign, {}), flags):
             train |= checked_table(given, where, "dataset", "seed", "run_dir")
     load_config(run_config(table.agent_or_foreign), {**train, "dataset": ""}, where)
-    arguments = {**checked_table(tables.evaluate, where, "run"), **checked_table(table.evaluate, where, "run")}
+    arguments = dict[str, Any]()
+    for given in (tables.evaluate, table.evaluate):
+        arguments |= checked_table(given, where, "run", *GivenDataset.OF_EVALUATE)
     config = load_config(evaluate.Config, {**arguments, "run": ""}, f"{where} [evaluate]")
     with located(f"{where} [evaluate]"):
         evaluate.settings(config)

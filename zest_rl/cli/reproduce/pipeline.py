@@ -109,7 +109,7 @@ def _make_datasets(
     config, evaluate = comparison.tasks[task], dict[str, Any]()
     if isinstance(config, GivenDataset):
         ui.say(f"[1/4] {task}: given dataset {config.dataset}")
-        source, evaluate = {"dataset": config.dataset}, config.arguments("env", "horizon", "success_key")
+        source, evaluate = {"dataset": config.dataset}, config.arguments(*GivenDataset.OF_EVALUATE)
     else:
         ui.say(f"[1/4] collect {task}")
         with stopwatch.stage("collect"):

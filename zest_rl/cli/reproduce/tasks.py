@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from zest_rl.cli.config import load_config
 from zest_rl.errors import BadInput
@@ -20,6 +20,8 @@ from zest_rl.errors import BadInput
 class GivenDataset:
     """A dataset that is there already, of any environment."""
 
+    OF_EVALUATE: ClassVar = ("env", "horizon", "success_key")
+    """Fields that are arguments of `zest evaluate`, which no other table of a recipe may set."""
     dataset: str
     """Its id."""
     made_by: str = ""
