@@ -234,8 +234,7 @@ def write_episodes(
     given = {name: score for name, score in references.items() if score is not None}
     if given and not (len(given) == 2 and -math.inf < given["ref_min_score"] < given["ref_max_score"] < math.inf):
         raise BadInput(
-            "reference scores must be two finite numbers, that of 0 % below that of 100 %, or none, got ref_min_score "
-            f"{ref_min_score} and ref_max_score {ref_max_score}"
+            f"reference scores must be two finite numbers, that of 0 % below that of 100 %, or none, got {references}"
         )
     arrays = [_flat({name: part for name, part in episode.items() if name != "seed"}) for episode in episodes]
     n_bytes = sum(array.nbytes for of_episode in arrays for array in of_episode.values())

@@ -8,7 +8,8 @@ A recipe has these tables (keys are the flags of the verb)::
     [collect]                       `zest collect`, for all tasks
     [tasks.NAME]                    `zest collect`, for this task; left out: the one task of [collect]. With a key
                                     task = "…" the name is free, and one task may have several datasets
-    [tasks.NAME]                    without [collect]: dataset = "ID", which is there already, of any environment;
+    [tasks.NAME]                    without [collect]: dataset = "ID", which is there already, of any environment, with
+                                    both reference scores (what `zest report` shows without, a recipe refuses);
                                     made_by = "…", the command that makes it; env = "package.module:make", horizon and
                                     success_key of `zest evaluate`; relabel = {…}, `zest relabel` for this task
     [relabel]                       `zest relabel`, for all goals
