@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,7 @@ from zest_rl.evaluation.rollout import run_episodes
 from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
+from zest_rl.simulation.makers import check_named, named_by_user
 
 SHORT = EvaluationConfig(n_episodes=2, seed=0, horizon=3)
 
@@ -166,9 +169,11 @@ def test_results_tell_lengths_returns_and_success_and_can_be_read_again(robots: 
 
 def test_returns_are_normalized_where_the_dataset_has_both_references(robots: Path, tmp_path: Path) -> None:
     run = edited(robots, "push", tmp_path, lambda meta: meta["dataset"].update(ref_min_score=-3.0, ref_max_score=0.0))
-    result = evaluate(run, SHORT, n_workers=1)
+    result = evaluate(run, EvaluationConfig(n_episodes=2), n_workers=1)
     np.testing.assert_allclose(result.normalized(), [100 * (e.gt_return + 3) / 3 for e in result.episodes])
     assert "normalized_return" in result.summary()
+    with pytest.warns(Notice, match=r"returns over 3 steps are not normalized: .* push/mine-v0 are of 10 steps"):
+        assert not evaluate(run, SHORT, n_workers=1).is_normalized
     one = edited(robots, "hopper", tmp_path, lambda meta: meta["dataset"].update(ref_min_score=-3.0))
     assert not evaluate(one, SHORT, n_workers=1).is_normalized
 
@@ -193,20 +198,12 @@ def test_the_folder_of_an_evaluation_in_the_kitchen_is_that_of_earlier_versions(
 
 def test_wrappers_that_were_recorded_are_made_again(robots: Path) -> None:
     env = gymnasium.wrappers.TimeAwareObservation(gymnasium.make("InvertedPendulum-v5", max_episode_steps=70))
-    meta = {"dataset": {"id": "a/b-v0", "env_spec": env.spec.to_json()}, "obs_dim": 5, "act_dim": 1, "max_steps": 9}
+    meta = {"dataset": {"id": "a/b-v0", "env_spec": env.spec.to_json()}, "obs_dim": 5, "act_dim": 1}
     made = find_environment(meta, horizon=5)
     assert made.make().observation_space.shape == (5,), "4 without the wrapper"
     assert made.horizon == 5
     assert find_environment(meta).horizon == 70, "as recorded"
-
-
-def test_a_horizon_that_nothing_registers_is_that_of_the_longest_episode(robots: Path) -> None:
-    meta = load_policy(robots / "push").meta
-    spec = json.loads(meta["dataset"]["env_spec"]) | {"max_episode_steps": None}
-    assert find_environment({**meta, "dataset": {**meta["dataset"], "env_spec": json.dumps(spec)}}).horizon == 10
-    assert find_environment(meta).horizon == 50, "as registered"
-    write_module(robots, "bare_push", "def make(): return gymnasium.make('FetchPush-v4', max_episode_steps=-1)")
-    assert find_environment(meta, env="bare_push:make").horizon == 10
+    assert find_environment({**meta, "max_steps": 9}).horizon == 9, "the longest episode of the data"
 
 
 def test_success_is_what_the_user_names(robots: Path) -> None:
@@ -223,8 +220,57 @@ def test_success_is_what_the_user_names(robots: Path) -> None:
     )
     config = EvaluationConfig(2, 0, env="tells_more:make", horizon=3, success_key="task/solved")
     assert [episode.success for episode in evaluate(robots / "push", config, n_workers=1).episodes] == [True, True]
-    with pytest.raises(BadInput, match=r"--success-key: info of tells_more:make has no 'solved'; .*is_success, task"):
+    with pytest.raises(
+        BadInput, match=r"--success-key: in an episode of tells_more:make .*'solved'; .*is_success, task/s"
+    ):
         find_environment(meta, env="tells_more:make", success_key="solved")
+
+
+def test_success_may_be_an_array_that_is_told_at_the_end_alone(robots: Path) -> None:
+    write_module(
+        robots,
+        "tells_late",
+        "import numpy as np",
+        "class Late(gymnasium.Wrapper):",
+        "    def step(self, action):",
+        "        *rest, truncated, info = self.env.step(action)",
+        "        info.pop('is_success')",
+        "        return *rest, truncated, {**info, 'success': np.array([False, True])} if truncated else info",
+        "def make(): return Late(gymnasium.make('FetchPush-v4', max_episode_steps=4))",
+    )
+    config = EvaluationConfig(2, 0, env="tells_late:make")
+    result = evaluate(robots / "push", config, n_workers=1)
+    assert [(episode.success, episode.n_steps) for episode in result.episodes] == [(True, 4), (True, 4)]
+    with pytest.warns(Notice, match=r"info of tells_late:make tells no success \(it has .*\); name it with --success"):
+        assert find_environment(load_policy(robots / "push").meta, env="tells_late:make", horizon=2).success_key is None
+
+
+def test_a_function_that_was_changed_is_evaluated_again(robots: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    body = "def make(): return gymnasium.wrappers.TransformReward(gymnasium.make('FetchPush-v4'), lambda reward: {})"
+    config, returns = EvaluationConfig(2, 0, env="my_push:make", horizon=3), []
+    for reward in (1.0, 2.0):
+        write_module(robots, "my_push", body.format(reward))
+        monkeypatch.delitem(sys.modules, "my_push", raising=False)
+        importlib.invalidate_caches()
+        result = evaluate(robots / "push", config, n_workers=1, videos=True)
+        returns.append(result.episodes[0].gt_return)
+        best = (result.folder / "best.mp4").stat().st_mtime_ns
+    assert returns == [3.0, 6.0]
+    assert evaluate(robots / "push", config, n_workers=1, videos=True).episodes[0].gt_return == 6
+    assert (result.folder / "best.mp4").stat().st_mtime_ns == best, "nothing was run again"
+
+
+def test_a_function_of_the_same_name_in_another_folder_was_not_named(
+    robots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_module(robots, "envs", "def make(): return gymnasium.make('FetchPush-v4')")
+    assert named_by_user("envs:make") == "envs:make"
+    check_named("envs:make", "a dataset")
+    write_module(tmp_path, "envs", "raise SystemExit('this was run')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path != str(robots)])
+    with pytest.raises(BadInput, match=r"a dataset names envs:make \(.*envs\.py\) .* did not name on this machine"):
+        check_named("envs:make", "a dataset")
 
 
 def test_an_environment_that_no_file_can_name_is_made_by_the_function_that_was_named(
@@ -248,7 +294,7 @@ def test_an_environment_that_no_file_can_name_is_made_by_the_function_that_was_n
     assert result.episodes[0].zest_return is not None, "who named it to relabel need not name it again"
     assert (result.folder / "best.mp4").exists()
     monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "of somebody else"))
-    with pytest.raises(BadInput, match=r"names my_door:make .* did not name on this machine; .* give --env my_door:m"):
+    with pytest.raises(BadInput, match=r"names my_door:make \(.*my_door\.py\) .* did not name .* give --env my_door:m"):
         evaluate(run, SHORT)
 
 
@@ -259,7 +305,7 @@ def test_an_environment_that_no_file_can_name_is_made_by_the_function_that_was_n
         (["def make(): pass"], "mine:mak", r"--env mine:mak: mine has no function 'mak'; did you mean 'make'\?"),
         (["def make(size): pass"], "mine:make", r"make\(size\) must be called without arguments .*'size'"),
         (["def make(): return 3"], "mine:make", r"--env mine:make must return a gymnasium\.Env, got int"),
-        (["def make(): return 1 / 0"], "mine:make", r"mine:make cannot be made here \(ZeroDivisionError: division"),
+        (["def make(): return len(3)"], "mine:make", r"here \(TypeError: object of type 'int'.*mend the function"),
         (["import not_there"], "mine:make", r"mine:make cannot be made here \(ModuleNotFoundError.*'not_there'"),
         ([], "FetchPush-v4", r"--env must be package\.module:make, .* got 'FetchPush-v4'"),
         (["def make(): return gymnasium.make('CartPole-v1')"], "mine:make", r"continuous actions \(Box\), but mine"),
@@ -277,7 +323,7 @@ def test_a_function_that_makes_no_environment_of_the_run_is_refused(
     lines: list[str], env: str, message: str, robots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delitem(__import__("sys").modules, "mine", raising=False)
+    monkeypatch.delitem(sys.modules, "mine", raising=False)
     monkeypatch.syspath_prepend(str(tmp_path))
     write_module(tmp_path, "mine", *lines)
     with pytest.raises(ZestError, match=message):

@@ -29,9 +29,9 @@ class Config:
     env: str | None = None
     """package.module:make, a function that makes the environment. Default: the dataset names it."""
     horizon: int | None = None
-    """Steps of an episode. Default: as registered, else those of the dataset's longest episode."""
+    """Steps of an episode. Default: those of the dataset's longest."""
     success_key: str | None = None
-    """Of success in info, such as success or task/solved. Default: is_success or success."""
+    """Of success in info, such as task/solved. Default: success or is_success."""
     rtg: Literal["online", "constant", "schedule"] = "online"
     """How the return-to-go falls: by the online score, not at all, or as in the best training episode."""
     target_quantile: float = 1.0
@@ -45,7 +45,7 @@ class Config:
     n_workers: int | None = None
     """Processes; default one per core."""
     trust: bool = False
-    """Run the policy and load the embedder that a run of somebody else names; remembered for these."""
+    """Run the policy, load the embedder and make the scene that a run of somebody else names; remembered for these."""
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:

@@ -6,6 +6,7 @@ that the user names (`zest_rl.simulation.makers`).
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -27,20 +28,20 @@ from zest_rl.data.env_specs import (
 )
 from zest_rl.data.observations import flatten, numeric_paths, observed
 from zest_rl.data.provenance import DatasetRecord
-from zest_rl.errors import BadInput, ZestError, nearest
+from zest_rl.errors import BadInput, Notice, ZestError, nearest
 from zest_rl.kitchen.env import ENV_ID, env_spec
+from zest_rl.runtime import artifacts
 from zest_rl.runtime.records import from_json
-from zest_rl.runtime.trust import is_remembered
-from zest_rl.simulation.makers import check_named, find_maker, named_by_user
-from zest_rl.simulation.recorder import DATA_FIELDS, MODEL_FIELDS
+from zest_rl.simulation.makers import check_named, find_maker, named_by_user, source_sha256
+from zest_rl.simulation.recorder import DATA_FIELDS, MODEL_FIELDS, SUCCESS_KEYS
 from zest_rl.sources import state_plugins
 from zest_rl.sources.recorded_envs import recorded_env, running_state
+from zest_rl.sources.states import versions
 from zest_rl.types import FloatArray
 
 MAX_HORIZON = 10_000
 """Steps of an episode."""
-SUCCESS_KEYS = ("is_success", "success")
-"""What environments call success in ``info``; the first that is there counts."""
+_MOST_PROBED = 1000  # steps in which success is looked for
 _INSTEAD = "give --env package.module:make, a function that makes it"
 _KITCHEN_STEPS_PER_SECOND, _STEPS_PER_SECOND = 12.5, 25.0
 
@@ -61,6 +62,8 @@ class RunEnvironment:
     """Steps per second of a video."""
     observed: tuple[str, ...] = ("",)
     """Paths of the observations that a policy is given, as `zest_rl.data.observations.numbers` chooses them."""
+    code_sha256: str = ""
+    """Of the versions of its packages and the file that makes it, so that one that was changed is evaluated again."""
 
     @property
     def is_kitchen(self) -> bool:
@@ -91,7 +94,8 @@ class RunEnvironment:
         at_reset = (look_up(info, "gt/reward") or 0.0) if self.is_kitchen else 0.0
         told: dict[str, NDArray[Any]] = {"gt_reward": np.asarray(at_reset if reward is None else reward, np.float32)}
         if self.success_key is not None:
-            told["gt_success"] = np.array(bool(np.any(look_up(info, self.success_key) or False)))
+            value = look_up(info, self.success_key)
+            told["gt_success"] = np.array(value is not None and bool(np.any(value)))
         return told | running_state(env.unwrapped, self.state)
 
 
@@ -122,7 +126,7 @@ def find_environment(
     Args:
         meta: the run's ``meta.json``.
         env: ``package.module:make``, which the user names; None: that of the dataset.
-        horizon: steps of an episode; None: as registered, else those of the dataset's longest episode.
+        horizon: steps of an episode; None: those of the dataset's longest, or as registered where these are unknown.
         success_key: of success in ``info``; None: the first of `SUCCESS_KEYS` that is there.
 
     Raises:
@@ -143,18 +147,22 @@ def find_environment(
 
 
 def is_evaluable(dataset: DatasetRecord) -> bool:
-    """Whether a dataset names the environment in which a policy can be evaluated, so that no ``env`` is needed."""
-    return dataset.env_spec is not None or (dataset.maker is not None and is_remembered("environment", dataset.maker))
+    """Whether a dataset names an environment in which a policy may be evaluated, so that no ``env`` is needed."""
+    try:
+        _named_by_data(dataset)
+    except ZestError:
+        return False
+    return True
 
 
 def _named_by_data(dataset: DatasetRecord) -> str:
     """Return what a dataset names as its environment, once it is safe to make it."""
     what = f"dataset {dataset.id}"
-    if dataset.env_spec is None:
-        if dataset.maker is None:
-            raise BadInput(f"{what} names no environment in which a policy could be evaluated; {_INSTEAD}")
+    if dataset.maker is not None:  # the user chose it rather than what was recorded
         check_named(dataset.maker, what)
         return dataset.maker
+    if dataset.env_spec is None:
+        raise BadInput(f"{what} names no environment in which a policy could be evaluated; {_INSTEAD}")
     text, spec = dataset.env_spec, dataset.env
     plugin = state_plugins.registered(str(spec.get("id")))
     instead = f"{_INSTEAD}, wrappers included"
@@ -203,11 +211,10 @@ def _make(made_by: str, horizon: int | None) -> gymnasium.Env[Any, Any]:
     except BadInput:
         raise
     except Exception as error:  # whatever an environment raises
-        arguments = " other arguments than it takes:" if isinstance(error, TypeError) else ""
-        raise ZestError(
-            f"{name} cannot be made here ({arguments}{type(error).__name__}: {error}); install what it needs in the "
-            f"version that it was recorded with, or {_INSTEAD}"
-        ) from error
+        advice = f"install what it needs in the version that it was recorded with, or {_INSTEAD}"
+        if MAKER.fullmatch(made_by):
+            advice = "mend the function, or install what it needs"
+        raise ZestError(f"{name} cannot be made here ({type(error).__name__}: {error}); {advice}") from error
     if not isinstance(env, gymnasium.Env):
         raise BadInput(f"--env {name} must return a gymnasium.Env, got {type(env).__name__}; return the environment")
     return env
@@ -224,20 +231,21 @@ def _probed(made_by: str, meta: Mapping[str, Any], horizon: int | None, success_
         env.action_space.seed(0)
         first, _ = env.reset(seed=0)
         after_reset = _model_fields(bare)
-        *_, info = env.step(env.action_space.sample())
-    except BadInput:
+        paths = numeric_paths([first])
+        _check_spaces(name, first, paths, env.action_space, meta)
+        own_horizon = None if env.spec is None else env.spec.max_episode_steps
+        steps = horizon or meta.get("max_steps") or own_horizon
+        if type(steps) is not int or not 1 <= steps <= MAX_HORIZON:
+            raise BadInput(f"{name} must have a horizon of 1 to {MAX_HORIZON} steps, got {steps}; give --horizon N")
+        key = _success_key(env, name, min(steps, _MOST_PROBED), success_key)
+    except ZestError:
         raise
     except Exception as error:  # whatever an environment raises
-        raise ZestError(f"{name} fails at its first step ({type(error).__name__}: {error})") from error
+        raise ZestError(
+            f"{name} fails in its first episode ({type(error).__name__}: {error}); mend it, or {_INSTEAD}"
+        ) from error
     finally:
         env.close()
-    paths = numeric_paths([first])
-    _check_spaces(name, first, paths, env.action_space, meta)
-    own_horizon = None if env.spec is None else env.spec.max_episode_steps
-    longest = meta.get("max_steps")
-    steps = horizon or own_horizon or longest
-    if type(steps) is not int or not 1 <= steps <= MAX_HORIZON:
-        raise BadInput(f"{name} must have a horizon of 1 to {MAX_HORIZON} steps, got {steps}; give --horizon N")
     scenery = recorded_env(_entry_point(made_by), bare).scenery(bare)
     changed = [field for field, values in compiled.items() if not np.array_equal(values, after_reset[field])]
     placed = [path.rpartition("/")[2] for path in scenery] or changed
@@ -247,10 +255,11 @@ def _probed(made_by: str, meta: Mapping[str, Any], horizon: int | None, success_
     return RunEnvironment(
         made_by,
         steps,
-        _success_key(name, info, success_key),
+        key,
         state if isinstance(getattr(bare, "model", None), mujoco.MjModel) else (),
         float(fps) if isinstance(fps, int | float) and 0 < fps <= 1000 else _STEPS_PER_SECOND,
         paths,
+        artifacts.hash_json([versions(), source_sha256(made_by) if MAKER.fullmatch(made_by) else None]),
     )
 
 
@@ -262,11 +271,36 @@ def _model_fields(env: Any) -> dict[str, NDArray[np.float64]]:
     return running_state(env, MODEL_FIELDS)
 
 
-def _success_key(name: str, info: Mapping[str, Any], given: str | None) -> str | None:
-    """Return the key of success in the ``info`` of a step; None where nothing tells it."""
-    if given is not None and look_up(info, given) is None:
-        raise BadInput(f"--success-key: info of {name} has no {given!r}; {nearest(given, map(str, info))}")
-    return given or next((key for key in SUCCESS_KEYS if key in info), None)
+def _success_key(env: gymnasium.Env[Any, Any], name: str, n_steps: int, given: str | None) -> str | None:
+    """Return the key of success in ``info``, which some tell at the end alone: look through an episode at random."""
+    wanted, keys = (given,) if given is not None else SUCCESS_KEYS, dict[str, None]()
+    for _ in range(n_steps):
+        *_, terminated, truncated, info = env.step(env.action_space.sample())
+        keys |= dict.fromkeys(_paths(info))
+        found = next((key for key in wanted if look_up(info, key) is not None), None)
+        if found is not None:
+            return found
+        if terminated or truncated:
+            break
+    if given is not None:
+        raise BadInput(
+            f"--success-key: in an episode of {name} at random, info has no {given!r}; {nearest(given, keys)}"
+        )
+    warnings.warn(
+        f"info of {name} tells no success (it has {', '.join(keys) or 'nothing'}); name it with --success-key",
+        Notice,
+        stacklevel=2,
+    )
+    return None
+
+
+def _paths(info: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """Return the keys of ``info``, those of nested dictionaries with ``/`` between them."""
+    parts = [
+        _paths(value, f"{prefix}{key}/") if isinstance(value, Mapping) else [f"{prefix}{key}"]
+        for key, value in info.items()
+    ]
+    return [path for part in parts for path in part]
 
 
 def _check_spaces(

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from zest_rl.agents import Policy, load_policy
 from zest_rl.data.provenance import DatasetRecord
-from zest_rl.errors import BadInput, nearest
+from zest_rl.errors import BadInput, Notice, nearest
 from zest_rl.evaluation.environments import KITCHEN, MAX_HORIZON, RunEnvironment, find_environment
 from zest_rl.evaluation.rollout import Rtg, Traces, run_episodes, uses_online_scores
 from zest_rl.evaluation.videos import episode_video
@@ -53,9 +54,9 @@ class EvaluationConfig:
     env: str | None = None
     """``package.module:make``, a function that makes the environment; None: the dataset names it."""
     horizon: int | None = None
-    """Steps of an episode; None: as registered, else those of the dataset's longest episode."""
+    """Steps of an episode; None: those of the dataset's longest, or as registered where these are unknown."""
     success_key: str | None = None
-    """Of success in ``info``; None: is_success or success."""
+    """Of success in ``info``; None: success or is_success."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields; those that are None, which earlier versions did not have, are left out."""
@@ -238,11 +239,14 @@ def evaluate(
     jobs: dict[str, _Job] = {}
     for part in chunks(config.n_episodes, max(EPISODES_PER_JOB, config.n_episodes // N_JOBS)):
         seeds = range(config.seed + part.start, config.seed + part.stop)
-        name = f"seeds-{seeds.start}-{seeds.stop}{'-scored' if scored else ''}"
+        stamp = "" if environment.is_kitchen else f"-{artifacts.hash_json(asdict(environment))[:8]}"
+        name = f"seeds-{seeds.start}-{seeds.stop}{'-scored' if scored else ''}{stamp}"
         jobs[name] = (run, config, environment, seeds, scored, device)
-    references = (dataset.ref_min_score, dataset.ref_max_score)
-    minimum, expert = references if None not in references else (None, None)
+    minimum, expert = _references(dataset, policy.meta, config, environment)
     with artifacts.lock(folder):
+        if not environment.is_kitchen and not all((folder / "parts" / f"{name}.npz").exists() for name in jobs):
+            for video in folder.glob("*.mp4"):  # of an environment that was changed since
+                video.unlink()
         for name in cached_jobs(_evaluate_part, jobs, folder / "parts", n_workers=n_workers, stage="rollouts"):
             if on_progress is not None:
                 on_progress(len(jobs[name][3]))
@@ -273,6 +277,25 @@ def evaluate(
         if videos:
             ensure_videos(episode_videos(result).values(), n_workers=n_workers)
     return result
+
+
+def _references(
+    dataset: DatasetRecord, meta: Mapping[str, Any], config: EvaluationConfig, environment: RunEnvironment
+) -> tuple[float | None, float | None]:
+    """Return the returns that are 0 and 100 %, sums over as many steps as the dataset's; None without any."""
+    if dataset.ref_min_score is None or dataset.ref_max_score is None:
+        return None, None
+    n_steps = meta.get("max_steps")
+    same = config.horizon is None if environment.is_kitchen else n_steps in (None, environment.horizon)
+    if same or config.horizon == n_steps:
+        return dataset.ref_min_score, dataset.ref_max_score
+    warnings.warn(
+        f"returns over {environment.horizon} steps are not normalized: the references of {dataset.id} are of "
+        f"{n_steps} steps",
+        Notice,
+        stacklevel=3,
+    )
+    return None, None
 
 
 def check_finished(run: Path) -> None:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.agents import Policy
 from zest_rl.data.provenance import DatasetRecord
-from zest_rl.errors import BadInput
+from zest_rl.errors import BadInput, ZestError
 from zest_rl.evaluation.environments import RunEnvironment, act_in, find_environment
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.types import FloatArray
@@ -80,7 +81,9 @@ def run_episodes(
             if len(running):
                 actions = policy.act(environment.flatten(observations))
             for i in running:
-                observations[i], rewards[i], terminated, truncated, info = envs[i].step(act_in(envs[i], actions[i]))
+                observations[i], rewards[i], terminated, truncated, info = _step(
+                    envs[i], actions[i], f"{environment.name} failed in step {step + 1} from seed {seeds[i]}"
+                )
                 told[i] = environment.tell(envs[i], float(rewards[i]), info)
                 if terminated or truncated:
                     n_steps[i] = step + 1
@@ -108,6 +111,15 @@ def run_episodes(
 
 def _record(policy: Policy) -> DatasetRecord:
     return DatasetRecord.of_run(policy.meta)
+
+
+def _step(env: gymnasium.Env[Any, Any], action: FloatArray, what: str) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    try:
+        return env.step(act_in(env, action))
+    except ZestError:
+        raise
+    except Exception as error:  # whatever an environment raises
+        raise ZestError(f"{what} ({type(error).__name__}: {error}); mend it, or choose another --seed") from error
 
 
 def _stacked(rows: list[dict[str, NDArray[Any]]]) -> Traces:

@@ -57,14 +57,14 @@ def method_row(method: Method, *tasks: Sequence[Evaluation]) -> MethodRow:
     )
 
 
-def dataset_row(*dataset_ids: str, paper: float | None = None) -> MethodRow:
-    """Summarise the datasets themselves, one per task (the paper's "Demo")."""
-    groups, successes, is_normalized = [], list[bool | None](), True
+def dataset_row(*dataset_ids: str, paper: float | None = None, is_normalized: bool = True) -> MethodRow:
+    """Summarise the datasets themselves, one per task (the paper's "Demo"), normalized if asked and if they can be."""
+    groups, successes = [], list[bool | None]()
     for dataset_id in dataset_ids:
         with open_dataset(dataset_id) as ds:
             record, truth = ds.record, ds.truth()
         returns, minimum, expert = true_returns(truth), record.ref_min_score, record.ref_max_score
-        if minimum is None or expert is None:
+        if minimum is None or expert is None or not is_normalized:
             is_normalized = False
         else:
             returns = normalized_return(returns, minimum, expert)
@@ -221,7 +221,8 @@ def compare(
     evaluations = {method.name: method.evaluations() for method in methods}
     rows = [method_row(method, evaluations[method.name]) for method in methods]
     if source_id is not None:
-        rows.insert(0, dataset_row(source_id, paper=paper_demo))
+        in_percent = all(row.is_normalized for row in rows)
+        rows.insert(0, dataset_row(source_id, paper=paper_demo, is_normalized=in_percent))
     scatters, goal_panels = [], []
     for name, dataset_id in goals.items():
         with open_dataset(dataset_id) as ds:
@@ -307,7 +308,11 @@ def overview(
 
 def _unequal_starts(evaluations: dict[str, list[Evaluation]]) -> list[str]:
     """Return a sentence if the methods were evaluated on different starts, or in different environments."""
-    horizons = {(each.environment.name, each.environment.horizon) for group in evaluations.values() for each in group}
+    horizons = {
+        (each.environment.name, each.traces["gt_reward"].shape[1] - 1)
+        for group in evaluations.values()
+        for each in group
+    }
     sentences = []
     if len(horizons) > 1:
         listed = ", ".join(f"{name} for {steps} steps" for name, steps in sorted(horizons))

@@ -22,7 +22,8 @@ def representative_episodes(
 ) -> list[EpisodePanel]:
     """Return the best, the median and the worst episode: video, score over time, ground-truth progress.
 
-    None where the environment cannot be drawn. Outside the kitchen the scores are those of the rollout, if it has any.
+    The list is empty where the environment cannot be drawn. Outside the kitchen the scores are those of the rollout, if
+    it has any.
     """
     episodes = []
     for which, index in representative(evaluation.returns()).items():
@@ -48,7 +49,9 @@ def paired_episodes(left: tuple[str, Evaluation], right: tuple[str, Evaluation],
         film: makes the videos.
     """
     (left_name, before), (right_name, after) = left, right
-    if before.config.starts != after.config.starts or before.environment != after.environment:
+    (n_before, frames_before), (n_after, frames_after) = (each.traces["gt_reward"].shape for each in (before, after))
+    is_paired = before.config.starts == after.config.starts and before.environment == after.environment
+    if not is_paired or (n_before, frames_before) != (n_after, frames_after):
         return []
     episodes = []
     returns = before.returns()

@@ -15,6 +15,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.data.env_specs import MAKER
 from zest_rl.data.provenance import ScorerRecord
 from zest_rl.embedders import DEFAULT_EMBEDDER, Embedder, Precision
 from zest_rl.errors import BadInput, ZestError
@@ -37,7 +38,7 @@ from zest_rl.runtime.files import check_file
 from zest_rl.runtime.parallel import one_thread
 from zest_rl.runtime.records import from_json, reading_record
 from zest_rl.runtime.trust import check_trusted, remember
-from zest_rl.simulation.makers import check_named
+from zest_rl.simulation.makers import check_named, named_by_user
 from zest_rl.sources.scene_views import SceneViews
 from zest_rl.sources.states import check_env
 from zest_rl.types import FloatArray
@@ -233,8 +234,8 @@ def check_scorer(path: Path, *, trust: bool = False) -> None:
     config, views, *_ = _read(path)
     if trust:
         remember("embedder", config.embedder)
-        if isinstance(views, SceneViews):
-            remember("environment", views.env_spec)
+        if isinstance(views, SceneViews) and MAKER.fullmatch(views.env_spec):
+            named_by_user(views.env_spec)
     _check_named(path, config, views)
 
 

@@ -1,7 +1,7 @@
 """``package.module:make``: environments that no file can name, made by a function that the user names.
 
 Only the user may name one, by ``--env`` or, once he did, by what he relabeled with it on this machine
-(`zest_rl.runtime.trust`); data alone never runs code.
+(`zest_rl.runtime.trust`, which keeps the file that the name stood for); data alone never runs code.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 
 from zest_rl.data.env_specs import MAKER
 from zest_rl.errors import BadInput, nearest
+from zest_rl.runtime import artifacts
 from zest_rl.runtime.trust import is_remembered, remember
 
 
@@ -27,8 +28,13 @@ def named_by_user(env: str) -> str:
     """
     if MAKER.fullmatch(env) is None:
         raise BadInput(f"--env must be package.module:make, a function that makes an environment, got {env!r}")
-    remember("environment", env)
+    remember("environment", _identity(env))
     return env
+
+
+def is_named(env: str) -> bool:
+    """Whether this user named this function, of the file in which it would be found now."""
+    return is_remembered("environment", _identity(env))
 
 
 def check_named(env: str, what: str) -> None:
@@ -37,11 +43,39 @@ def check_named(env: str, what: str) -> None:
     Raises:
         BadInput: it would run code that this user did not name.
     """
-    if MAKER.fullmatch(env) and not is_remembered("environment", env):
+    if MAKER.fullmatch(env) and not is_named(env):
+        where = _file(env) or f"no such module in {Path.cwd()}: go to the folder that holds it"
         raise BadInput(
-            f"{what} names {env} as the function that makes its environment, which you did not name on this machine; "
-            f"if you know its code, give --env {env}, which runs it"
+            f"{what} names {env} ({where}) as the function that makes its environment, which you did not name on this "
+            f"machine; if you know its code, give --env {env}, which runs it"
         )
+
+
+def source_sha256(env: str) -> str | None:
+    """Return the hash of the file of a function's module, or of its outermost package; None without any."""
+    file = _file(env)
+    return None if file is None else artifacts.hash_file(file)
+
+
+def _identity(env: str) -> dict[str, str | None]:
+    file = _file(env)
+    return {"function": env, "file": None if file is None else str(file)}
+
+
+def _file(env: str) -> Path | None:
+    """Return the file that the first part of a name stands for, without running it; None without any."""
+    _look_here()
+    try:
+        spec = importlib.util.find_spec(env.partition(":")[0].partition(".")[0])
+    except ValueError:  # it is __main__, or was put together by hand
+        return None
+    return Path(spec.origin).resolve() if spec is not None and spec.origin and Path(spec.origin).is_file() else None
+
+
+def _look_here() -> None:
+    """Let modules of the working directory be imported, after those that are installed, which they must not replace."""
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.append(here)
 
 
 def find_maker(maker: str) -> Callable[[], Any]:
@@ -51,15 +85,14 @@ def find_maker(maker: str) -> Callable[[], Any]:
         BadInput: there is no such module or function, or it needs arguments.
     """
     module_name, _, name = maker.partition(":")
-    if (here := str(Path.cwd())) not in sys.path:
-        sys.path.insert(0, here)
+    _look_here()
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         if not f"{module_name}.".startswith(f"{error.name}."):
             raise
         raise BadInput(
-            f"--env {maker}: there is no module {error.name!r} in {here} or among the installed packages; write "
+            f"--env {maker}: there is no module {error.name!r} in {Path.cwd()} or among the installed packages; write "
             "package.module:make, where package/module.py is in this folder or installed"
         ) from error
     make: Any = getattr(module, name, None)

@@ -22,7 +22,8 @@ MODEL_FIELDS = ("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "
 """Of a model, what an environment may change at its reset, so that frames depend on it."""
 DATA_FIELDS = ("qpos", "mocap_pos", "mocap_quat")
 """Of the simulator's data, what frames depend on."""
-_SUCCESS = ("success", "is_success")
+SUCCESS_KEYS = ("success", "is_success")
+"""What environments call success in ``info``; the first that is there counts."""
 
 
 class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -74,7 +75,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
                 state[name] = now.ravel().copy()
         episode.observations.append(_copied(observation))
         episode.states.append(state)
-        succeeded = next((info[name] for name in _SUCCESS if name in info), None)
+        succeeded = next((info[name] for name in SUCCESS_KEYS if name in info), None)
         episode.successes.append(None if succeeded is None else bool(succeeded))
 
     @property

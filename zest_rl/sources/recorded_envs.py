@@ -6,7 +6,7 @@ One row of `RECORDED_ENVS` is one environment; without a row only the recorded `
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
@@ -132,7 +132,13 @@ RECORDED_ENVS = (
 
 
 def recorded_env(entry_point: str, env: Any) -> RecordedEnv:
-    """Return the row of an environment (without its wrappers) or of what its class extends; else a default one."""
-    names = [entry_point, *(f"{base.__module__}:{base.__qualname__}" for base in type(env).__mro__)]
-    rows = (row for name in names for row in RECORDED_ENVS if name.startswith(row.prefix))
+    """Return the row of an environment, or what that of its class says of states; else a default one.
+
+    What a row says of observations is of the registered environment alone: wrappers or a subclass may change them.
+    """
+    registered = next((row for row in RECORDED_ENVS if entry_point.startswith(row.prefix)), None)
+    if registered is not None:
+        return registered
+    bases = [f"{base.__module__}:{base.__qualname__}" for base in type(env).__mro__]
+    rows = (replace(row, qpos=None) for name in bases for row in RECORDED_ENVS if name.startswith(row.prefix))
     return next(rows, RecordedEnv(entry_point))

@@ -18,7 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from zest_rl.data.env_specs import MAKER, check_env_spec, check_model_files, without_wrappers
+from zest_rl.data.env_specs import MAKER, check_env_spec, check_model_files, entry_points, without_wrappers
 from zest_rl.data.hdf5 import check_rows, open_hdf5, read_array
 from zest_rl.data.observations import entries
 from zest_rl.errors import BadInput, ZestError
@@ -155,6 +155,7 @@ def check_env(env_spec: str | None, what: str) -> str:
         )
     if MAKER.fullmatch(env_spec):
         return env_spec
+    entry_points(env_spec, f"the env_spec of {what}")
     spec = json.loads(env_spec)
     if state_plugins.registered(str(spec.get("id"))) is None:
         code = without_wrappers(env_spec)
