@@ -260,17 +260,28 @@ def test_a_function_that_was_changed_is_evaluated_again(robots: Path, monkeypatc
     assert (result.folder / "best.mp4").stat().st_mtime_ns == best, "nothing was run again"
 
 
+@pytest.mark.parametrize("module", ["envs", "package.envs", "package.inner"])
 def test_a_function_of_the_same_name_in_another_folder_was_not_named(
-    robots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    module: str, robots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_module(robots, "envs", "def make(): return gymnasium.make('FetchPush-v4')")
-    assert named_by_user("envs:make") == "envs:make"
-    check_named("envs:make", "a dataset")
-    write_module(tmp_path, "envs", "raise SystemExit('this was run')")
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    for place in ("mine", "theirs"):
+        (tmp_path / place / "package" / "inner").mkdir(parents=True)
+        for name in ("envs", "package/envs", "package/inner/__init__"):
+            write_module(tmp_path / place, name, "raise SystemExit('this was run')")
+    monkeypatch.chdir(tmp_path / "mine")
+    assert named_by_user(f"{module}:make") == f"{module}:make"
+    check_named(f"{module}:make", "a dataset")
+    sys.path.remove(str(tmp_path / "mine"))
+    monkeypatch.chdir(tmp_path / "theirs")
+    importlib.invalidate_caches()
+    with pytest.raises(BadInput, match=rf"names {module}:make \(.*theirs.*\.py\) .* did not name on this machine"):
+        check_named(f"{module}:make", "a dataset")
+    sys.path.remove(str(tmp_path / "theirs"))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [path for path in sys.path if path != str(robots)])
-    with pytest.raises(BadInput, match=r"a dataset names envs:make \(.*envs\.py\) .* did not name on this machine"):
-        check_named("envs:make", "a dataset")
+    importlib.invalidate_caches()
+    with pytest.raises(BadInput, match=r"no such module in .*: go to the folder that holds it"):
+        check_named(f"{module}:make", "a dataset")
 
 
 def test_an_environment_that_no_file_can_name_is_made_by_the_function_that_was_named(
@@ -302,7 +313,7 @@ def test_an_environment_that_no_file_can_name_is_made_by_the_function_that_was_n
     ("lines", "env", "message"),
     [
         ([], "no_module:make", r"--env no_module:make: there is no module 'no_module' in .* or among the installed"),
-        (["def make(): pass"], "mine:mak", r"--env mine:mak: mine has no function 'mak'; did you mean 'make'\?"),
+        (["def make(): pass"], "mine:mak", r"mine:mak: mine .*mine\.py\) has no function 'mak'; did you mean 'make'\?"),
         (["def make(size): pass"], "mine:make", r"make\(size\) must be called without arguments .*'size'"),
         (["def make(): return 3"], "mine:make", r"--env mine:make must return a gymnasium\.Env, got int"),
         (["def make(): return len(3)"], "mine:make", r"here \(TypeError: object of type 'int'.*mend the function"),

@@ -34,7 +34,7 @@ def named_by_user(env: str) -> str:
 
 def is_named(env: str) -> bool:
     """Whether this user named this function, of the file in which it would be found now."""
-    return is_remembered("environment", _identity(env))
+    return _file(env) is not None and is_remembered("environment", _identity(env))
 
 
 def check_named(env: str, what: str) -> None:
@@ -52,7 +52,7 @@ def check_named(env: str, what: str) -> None:
 
 
 def source_sha256(env: str) -> str | None:
-    """Return the hash of the file of a function's module, or of its outermost package; None without any."""
+    """Return the hash of the file of a function's module (not of what it imports); None without any."""
     file = _file(env)
     return None if file is None else artifacts.hash_file(file)
 
@@ -63,13 +63,20 @@ def _identity(env: str) -> dict[str, str | None]:
 
 
 def _file(env: str) -> Path | None:
-    """Return the file that the first part of a name stands for, without running it; None without any."""
+    """Return the file of a function's module, without running any code; None without any."""
     _look_here()
+    first, *rest = env.partition(":")[0].split(".")
     try:
-        spec = importlib.util.find_spec(env.partition(":")[0].partition(".")[0])
+        spec = importlib.util.find_spec(first)
     except ValueError:  # it is __main__, or was put together by hand
         return None
-    return Path(spec.origin).resolve() if spec is not None and spec.origin and Path(spec.origin).is_file() else None
+    if spec is None:
+        return None
+    stems = [Path(folder, *rest) for folder in spec.submodule_search_locations or ()] if rest else []
+    files = [file for stem in stems for file in (stem / "__init__.py", stem.parent / f"{stem.name}.py")]
+    if not rest and spec.origin:
+        files = [Path(spec.origin)]
+    return next((file.resolve() for file in files if file.is_file()), None)
 
 
 def _look_here() -> None:
@@ -98,7 +105,9 @@ def find_maker(maker: str) -> Callable[[], Any]:
     make: Any = getattr(module, name, None)
     if not callable(make):
         functions = [known for known, value in vars(module).items() if inspect.isfunction(value)]
-        raise BadInput(f"--env {maker}: {module_name} has no function {name!r}; {nearest(name, functions)}")
+        raise BadInput(
+            f"--env {maker}: {module_name} ({module.__file__}) has no function {name!r}; {nearest(name, functions)}"
+        )
     try:
         inspect.signature(make).bind()
     except TypeError as error:

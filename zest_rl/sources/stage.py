@@ -1,7 +1,7 @@
 """An environment of another package as a renderer of recorded states: its model, and cameras that look at it.
 
 Frames are drawn like the kitchen's: without shadows, reflections, multisampling or sky. Only registered environments
-are made, without their wrappers.
+are made, and those of functions that the user names; without their wrappers.
 """
 
 from __future__ import annotations
