@@ -21,7 +21,7 @@ CELL, GAP, TITLE = 160, 4, 16
 MAX_ROWS = 8
 
 
-FRAME_OPTIONS = ("frames", "env", "robot", "look_at", "show_robot", "tolerance", "skip_incomplete")
+FRAME_OPTIONS = ("frames", "env", "robot", "look_at", "show_robot", "tolerance", "skip_incomplete", "masks")
 """Arguments of `zest_rl.rewards.relabel.relabel` that `open_source` takes by the same names."""
 
 

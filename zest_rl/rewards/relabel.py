@@ -108,6 +108,7 @@ def relabel(
     show_robot: bool = Views.robot,
     tolerance: float = Views.tolerance,
     skip_incomplete: bool = False,
+    masks: Sequence[str] = (),
     embedder: str = DEFAULT_EMBEDDER,
     features: Features = "delta",
     similarity: Similarity = "cos",
@@ -117,7 +118,7 @@ def relabel(
 ) -> Relabeled:
     """Write a copy of a dataset whose rewards are ZeST scores, with the arguments of `zest relabel`.
 
-    `dataset` and `frames` … `skip_incomplete` choose the frames (`open_source`), `goal` and `embedder` … `goal_share`
+    `dataset` and `frames` … `masks` choose the frames (`open_source`), `goal` and `embedder` … `goal_share`
     the scorer (`ScorerConfig`); the other options and the errors are those of `relabel_source`.
     """
     config = ScorerConfig(goal, embedder, features, similarity, precision, goal_share)
@@ -132,6 +133,7 @@ def relabel(
         show_robot=show_robot,
         tolerance=tolerance,
         skip_incomplete=skip_incomplete,
+        masks=masks,
     )
     return relabel_source(source, config, **options)
 

@@ -7,6 +7,7 @@
 | Minari dataset with recorded MuJoCo states | copied | what is moved, without the robot, from a ring (`scenes`) |
 | the same with `--camera NAME` or `default` | copied | rendered with everything in it (`states`) |
 | any of these with `--frames FOLDER …` | | videos or pictures in a folder (`videos`) |
+| any with `--masks FOLDER …` | | with masked pixels filled from other frames (`masked`) |
 | robomimic's HDF5 | imported (`robomimic`) | its pictures |
 | LeRobot v3 folder | imported (`lerobot`) | its videos, or pictures (`parquet_pictures`) |
 """
@@ -27,6 +28,7 @@ from zest_rl.simulation.makers import named_by_user
 from zest_rl.simulation.scene import SceneConfig
 from zest_rl.sources.base import EpisodeFrames, Source
 from zest_rl.sources.kitchen import KitchenStates, read_kitchen
+from zest_rl.sources.masked import without_masked
 from zest_rl.sources.pictures import Pictures, picture_entries
 from zest_rl.sources.videos import find_videos
 
@@ -58,6 +60,7 @@ def open_source(
     show_robot: bool = Views.robot,
     tolerance: float = Views.tolerance,
     skip_incomplete: bool = False,
+    masks: Sequence[str] = (),
 ) -> Source:
     """Find a dataset's episodes and their frames.
 
@@ -74,14 +77,15 @@ def open_source(
         show_robot: scenes and kitchen only: keep the robot in view.
         tolerance: scenes and kitchen only: grid of the states.
         skip_incomplete: LeRobot only: leave out episodes without steps, and those whose files are missing.
+        masks: folders with masks of what hides the scene, one per view of frames that show a robot (`masked`).
 
     Raises:
         BadInput: no such dataset, or its frames are missing or ambiguous; the message lists the candidates.
     """
     with nullcontext() if _is_path(dataset) else reader.open_dataset(dataset) as ds:
-        if env is not None:
-            named_by_user(env)
+        of_states = {"--env": env is not None}
         of_scenes = {"--robot": bool(robot), "--look-at": look_at is not None}
+        of_frames = {"--masks": bool(masks)}
         rendering = {
             **of_scenes,
             "--views": n_views != Views.n_views,
@@ -89,10 +93,19 @@ def open_source(
             "--tolerance": tolerance != Views.tolerance,
         }
         if ds is not None and ds.record.task is not None and not (frames or cameras):
-            _refuse(of_scenes, "are not for zest/Kitchen-v1, whose robot and objects are known")
+            _refuse(
+                of_states | of_scenes | of_frames,
+                "cannot be given for zest/Kitchen-v1, whose robot and objects are known",
+            )
             return read_kitchen(ds, Views(ds.record.task, n_views, robot=show_robot, tolerance=tolerance))
         if frames or cameras or ds is None:
             _refuse(rendering, "belong to the ring of views round an object, which needs recorded MuJoCo states alone")
+        if frames or ds is None:
+            _refuse(
+                of_states, "makes the environment of a Minari dataset's recorded states, which are not what is seen"
+            )
+        if env is not None:
+            named_by_user(env)
         if frames and cameras:
             raise BadInput("--camera renders recorded states, --frames says where pictures are; give one of them")
         if skip_incomplete and (ds is not None or not user_path(dataset).is_dir()):
@@ -117,6 +130,9 @@ def open_source(
         episode_frames = find_videos(folders, len(trajectories.n_steps), dataset)
     if episode_frames is None:
         raise BadInput(f"{dataset} shows no frames; give --frames FOLDER with a video of each episode")
+    if masks:
+        n_episodes = len(trajectories.n_steps)
+        episode_frames = without_masked(episode_frames, [user_path(name) for name in masks], n_episodes, dataset)
     return Source(trajectories, episode_frames)
 
 
@@ -138,7 +154,7 @@ def _open_path(
 
 def _refuse(flags: Mapping[str, bool], why: str) -> None:
     if given := [flag for flag, is_given in flags.items() if is_given]:
-        raise BadInput(f"{' and '.join(given)} {why}; leave them out")
+        raise BadInput(f"{' and '.join(given)} {why}; leave {'them' if len(given) > 1 else 'it'} out")
 
 
 def _minari_frames(

@@ -27,7 +27,7 @@ from zest_rl.simulation.bodies import (
     robot_bodies,
     subtree,
 )
-from zest_rl.simulation.framing import ObjectRing, azimuth_of, centre, radius, robot_side
+from zest_rl.simulation.framing import ObjectRing, azimuth_of, centre, object_geoms, radius, robot_side
 from zest_rl.simulation.rendering import Camera
 from zest_rl.simulation.scene import SceneConfig
 from zest_rl.sources.recorded_envs import Doubles, State
@@ -187,6 +187,8 @@ def _looked_at(model: mujoco.MjModel, config: SceneConfig, robot: Bodies, travel
             f"--look-at: {config.look_at!r} belongs to the robot, which is hidden; keep it in view with --show-robot, "
             "or name the bodies that are the robot with --robot BODY …"
         )
+    if not len(object_geoms(model, body)):
+        raise BadInput(f"--look-at: {config.look_at!r} has no geoms, so there is nothing to see; name a body that has")
     return body
 
 

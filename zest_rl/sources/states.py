@@ -208,6 +208,14 @@ def recorded_states(
     states = States(file, tuple(episodes), env_spec, columns, (*scenery, *fields), noisy=noisy)
     if (width := len(states.start(0)["qpos"])) != simulation.model.nq:
         raise BadInput(f"{what}: qpos must have {simulation.model.nq} columns for {spec.get('id')}, got {width}")
+    for owner, names in ((simulation.model, MODEL_FIELDS), (simulation.data, DATA_FIELDS)):
+        for name in {*names} & {path.rpartition("/")[2] for path in fields}:
+            expected, got = getattr(owner, name).size, len(states.start(0)[name])
+            if got != expected:
+                raise BadInput(
+                    f"{what}: {name} must hold {expected} numbers for {spec.get('id')}, got {got}; install the version "
+                    "of its package that it was recorded with"
+                )
     return states
 
 

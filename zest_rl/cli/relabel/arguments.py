@@ -56,6 +56,9 @@ class Config:
     """Keep the robot in view (the paper removes it)."""
     tolerance: float = 1e-3
     """States that agree to this many rad or m are rendered and embedded once; 0: only equal states."""
+    masks: tuple[str, ...] = ()
+    """Folders with a mask for each frame (white: the robot), one per view, as videos or PNGs like --frames; what they
+    hide is filled from the frames in which it is seen. The cameras must not move."""
     skip_incomplete: bool = False
     """Leave out the episodes of a LeRobot folder that have no steps, or whose files were not downloaded."""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
