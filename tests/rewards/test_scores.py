@@ -13,6 +13,7 @@ from zest_rl.rewards.scores import (
     LOGIT_SCALE,
     PROJECTED,
     ZERO_DELTA,
+    change_beside_goal,
     check_names,
     pair_starts,
     score_classifier,
@@ -288,3 +289,16 @@ def test_an_unknown_feature_or_similarity_is_refused_with_the_nearest_right_one(
         check_names("raw", "cosine")
     with pytest.raises(BadInput, match="features 'progress' bring a similarity of their own, got 'l2'"):
         score_views(FRAMES[:, None], ONE, ONE, "progress", "l2")
+
+
+def test_a_change_is_measured_beside_the_goals() -> None:
+    rng = np.random.default_rng(0)
+    starts, goals = (rng.normal(size=(3, 8)).astype(np.float32) for _ in range(2))
+    ends = rng.normal(size=(5, 2, 8)).astype(np.float32)
+    size, cosine = change_beside_goal(ends, starts, goals)
+    changes = goals - starts[pair_starts(starts.astype(float), goals.astype(float))]
+    moved = ends[:, 1] - ends[:, 0]
+    expected = np.median(np.linalg.norm(moved, axis=1)) / np.median(np.linalg.norm(changes, axis=1))
+    assert size == pytest.approx(expected)
+    unit = [rows / np.linalg.norm(rows, axis=1, keepdims=True) for rows in (moved, changes)]
+    assert cosine == pytest.approx(np.median((unit[0] @ unit[1].T).mean(axis=1)), abs=1e-6)

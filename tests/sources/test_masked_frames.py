@@ -11,8 +11,11 @@ import gymnasium_robotics  # noqa: F401  # registers its environments
 import numpy as np
 import pytest
 from PIL import Image
+from read_dataset import read
 from rollouts import Run
 
+from zest_rl.data.reader import Dataset
+from zest_rl.errors import BadInput
 from zest_rl.simulation.bodies import robot_bodies
 from zest_rl.simulation.recorder import Recorder
 from zest_rl.sources import open_source
@@ -93,8 +96,21 @@ def test_masks_that_do_not_fit_are_refused(
     assert (code, "--masks needs a folder for each of the 1 views (external_camera_0)" in error) == (2, True)
 
 
-def test_a_dataset_is_relabeled_by_frames_without_the_robot(waving: str, goal: Path, zest: Run, tmp_path: Path) -> None:
+def test_a_block_at_rest_scores_flat_where_the_arm_is_masked(
+    waving: str, goal: Path, zest: Run, tmp_path: Path
+) -> None:
     write_masks(tmp_path / "masks", rendered(waving))
     words = ["relabel", waving, "--goal", goal, "--n-workers", "1", "--camera", CAMERA]
     with_robot, without = zest(*words), zest(*words, "--masks", tmp_path / "masks")
-    assert with_robot["dataset"] != without["dataset"]
+    moved, still = (np.ptp(read(result["dataset"], Dataset.scores)[0]) for result in (with_robot, without))
+    assert moved > 2 * still
+
+
+def test_masks_of_labels_and_masks_where_nothing_is_shown_of_the_robot_are_refused(waving: str, tmp_path: Path) -> None:
+    masks = write_masks(tmp_path / "labels", rendered(waving))
+    for step, mask in enumerate(masks):
+        Image.fromarray(mask.astype(np.uint8)).save(tmp_path / "labels" / "episode_0" / f"{step}.png")
+    with pytest.raises(BadInput, match="masks must be black and white"):
+        list(open_source(waving, cameras=[CAMERA], masks=[str(tmp_path / "labels")]).frames.read(0))
+    with pytest.raises(BadInput, match="--masks is for frames that show a robot"):
+        open_source(waving, look_at="object0", masks=[str(tmp_path / "labels")])

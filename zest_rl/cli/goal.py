@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,12 +34,20 @@ class Config:
     """Body of the model in the middle of the views."""
     show_robot: bool = False
     """Keep the robot in view."""
+    masks: tuple[str, ...] = ()
+    """Folders with masks of the robot, one per view."""
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Render or read, and write."""
+    from zest_rl.data.video import VIDEO_SUFFIXES
     from zest_rl.rewards.episode_goals import write_goal
 
-    chosen = {name: getattr(config, name) for name in ("frames", "env", "robot", "look_at", "show_robot")}
+    chosen = {name: getattr(config, name) for name in ("frames", "env", "robot", "look_at", "show_robot", "masks")}
     folder, goal = write_goal(config.dataset, config.episode, config.output, cameras=config.camera, **chosen)
-    return {"goal": str(folder), "n_views": len(goal.goals), "next": f"zest relabel DATASET --goal {folder}"}
+    is_video = Path(config.dataset).suffix.lower() in VIDEO_SUFFIXES
+    words = ["zest", "relabel", "DATASET" if is_video else config.dataset, "--goal", str(folder)]
+    for name, value in {"camera": config.camera, **chosen}.items():
+        given = [] if value is True else [value] if isinstance(value, str) else list(value or ())
+        words += [f"--{name.replace('_', '-')}", *given] if value else []
+    return {"goal": str(folder), "n_views": len(goal.goals), "next": shlex.join(words)}

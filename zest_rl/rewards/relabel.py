@@ -28,6 +28,7 @@ from zest_rl.runtime import artifacts
 from zest_rl.runtime.parallel import Engine
 from zest_rl.runtime.privacy import masked
 from zest_rl.sources import EpisodeFrames, KitchenStates, Source, open_source
+from zest_rl.sources.masked import MaskedFrames
 from zest_rl.sources.scenes import SceneStates
 from zest_rl.types import FloatArray
 
@@ -53,6 +54,8 @@ class Relabeled:
     """``distinct_states`` or ``episodes``."""
     n_still: int | None
     """Number of unchanged frames, equal to the first of their episode; None if the dataset existed."""
+    view_cannot_tell: bool = False
+    """See `zest_rl.rewards.scorer.Scorer.view_cannot_tell`; only of one view in which the robot is not hidden."""
 
     @property
     def already_there(self) -> bool:
@@ -179,10 +182,11 @@ def relabel_source(
     target_id = relabeled_id(trajectories.dataset_id, digest)
     path = reader.dataset_path(target_id)
 
-    def result(scorer: Scorer, n_still: int | None) -> Relabeled:
+    def result(scorer: Scorer, n_still: int | None, *, view_cannot_tell: bool = False) -> Relabeled:
         n_frames = sum(trajectories.n_steps) + len(trajectories.n_steps)
         n_embedded = embeddings.n_embedded
-        return Relabeled(target_id, path, source, scorer, n_frames, n_embedded, embeddings.unit, n_still)
+        unit = embeddings.unit
+        return Relabeled(target_id, path, source, scorer, n_frames, n_embedded, unit, n_still, view_cannot_tell)
 
     def existing() -> Relabeled:
         """Return the dataset on disk, and a scorer with the goals that it kept."""
@@ -224,7 +228,11 @@ def relabel_source(
             zest={"relabel": record.to_json()},
             extra=lambda folder: _write_scorer(folder, scorer, source.frames),
         )
-    return result(scorer, n_still)
+        of_pictures = scorer.goal is not None and not scorer.goal.is_text
+        is_masked = isinstance(source.frames, KitchenStates | SceneStates | MaskedFrames)
+        one_camera = len(source.frames.views) == 1 and not is_masked and of_pictures
+        view_cannot_tell = one_camera and scorer.view_cannot_tell(embeddings)
+    return result(scorer, n_still, view_cannot_tell=view_cannot_tell)
 
 
 def _open(

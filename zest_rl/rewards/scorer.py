@@ -26,6 +26,7 @@ from zest_rl.rewards.scores import (
     NUMBERS,
     Features,
     Similarity,
+    change_beside_goal,
     check_goal_share,
     check_names,
     score_views,
@@ -43,6 +44,9 @@ from zest_rl.sources.scene_views import SceneViews
 from zest_rl.sources.states import check_env
 from zest_rl.types import FloatArray
 
+OTHER_DIRECTION = 0.1
+"""Cosine of a change and the goal's below which they have nothing to do with each other; pictures of other scenes than
+the dataset's have such cosines, too, and then only the mean over views tells."""
 SCORER_FILE = "zest_scorer.safetensors"
 """Name of a scorer's file in a dataset that it relabeled, and in the runs that were trained on it."""
 
@@ -136,6 +140,13 @@ class Scorer:
             scorer = self if self.starts.ndim == 2 else replace(self, starts=self.starts[view], goals=self.goals[view])
             scores.append(scorer.score_episode(replace(episode, embeddings=episode.embeddings[:, view])))
         return np.stack(scores)
+
+    def view_cannot_tell(self, episodes: Iterable[EmbeddedEpisode]) -> bool:
+        """Whether the only view changes as much as the goal does, but in other directions, as where a robot moves."""
+        ends = np.concatenate([episode.ends.swapaxes(0, 1) for episode in episodes])
+        dim = ends.shape[-1]
+        size, cosine = change_beside_goal(ends, self.starts.reshape(-1, dim), self.goals.reshape(-1, dim))
+        return size >= 1 and cosine < OTHER_DIRECTION
 
     def goals_near(self, episodes: Iterable[EmbeddedEpisode]) -> NDArray[np.intp]:
         """Choose the share ``config.goal_share`` of the goals (at least one) nearest to the ends of the episodes.

@@ -150,6 +150,23 @@ def score_delta(
     return _mean_over_goals(_similarity(_change(frames, frames[0]), _change(goals, starts), similarity))
 
 
+def change_beside_goal(ends: FloatArray, starts: FloatArray, goals: FloatArray) -> tuple[float, float]:
+    """Compare how one view changes over episodes to how the goal changes; medians over episodes.
+
+    Args:
+        ends: (N, 2, D) embeddings of the first and the last frame of N episodes.
+        starts: (S, D) embeddings.
+        goals: (K, D) embeddings.
+
+    Returns:
+        The length of ψ(x_T) − ψ(x_0), in units of that of ψ(G_f) − ψ(G_0); and their cosine, φ_T of `score_delta`.
+    """
+    cosines = [score_delta(pair, starts, goals)[-1] for pair in ends]
+    _, last, first = _checked(ends[0], starts, goals)
+    lengths = np.linalg.norm(ends[:, 1].astype(np.float64) - ends[:, 0], axis=1)
+    return float(np.median(lengths) / np.median(np.linalg.norm(last - first, axis=1))), float(np.median(cosines))
+
+
 def _unit(rows: Doubles) -> Doubles:
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
     return np.asarray(np.divide(rows, lengths, out=np.zeros_like(rows), where=lengths > 0))

@@ -21,7 +21,8 @@ Point = tuple[float, float, float]
 _DRAWN_GROUPS = 3
 _SPREAD = 30.0  # degrees to either side
 _ELEVATIONS = (-15.0, -20.0, -30.0)  # degrees
-_DISTANCES = (2.0, 1.5, 2.8)  # in units of the object's radius, in the proportions of the kitchen's 1, 0.7 and 1.4 m
+_DISTANCES = (2.6, 1.8, 3.6)
+"""In units of the ring's radius: that of the kitchen's doors is 0.385 m (median), which 1, 0.7 and 1.4 m suit."""
 _SEEN = 0.5  # of the object; a view that sees less shows the scene rather than the object
 _LIFTS = (0.0, 15.0, 30.0, 45.0)  # degrees by which a ring is lifted until half of its views see the object
 
@@ -33,17 +34,20 @@ class ObjectRing:
     azimuth: float
     """In degrees, of the view from behind the robot; 90 looks along +y."""
     radius: float
-    """Of the object with the way that it goes, in metres."""
+    """Half of the diagonal of the box round the object and the way that it goes, in metres."""
     n_views: int
+    offset: Point = (0.0, 0.0, 0.0)
+    """From the middle of the object in x_0 to the middle of that box, in metres."""
     lift: float = 0.0
     """Degrees by which the cameras look down more steeply."""
     dropped: tuple[int, ...] = ()
     """Indices of the views that are not drawn."""
 
     def cameras(self, lookat: Point) -> tuple[Camera, ...]:
-        """Return the cameras that look at a point."""
+        """Return the cameras for an object whose middle is at a point in x_0."""
+        (x, y, z), (dx, dy, dz) = lookat, self.offset
         views = ring(
-            lookat,
+            (x + dx, y + dy, z + dz),
             self.n_views,
             azimuths=(self.azimuth - _SPREAD, self.azimuth + _SPREAD),
             distances=[self.radius * share for share in _DISTANCES],
@@ -99,22 +103,23 @@ def object_geoms(model: mujoco.MjModel, body: int) -> NDArray[np.intp]:
     return drawn_geoms(model, subtree(model, [body]))
 
 
-def centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Point:
-    """Return the middle of an object as it stands in `data`, in metres."""
+def extent(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> NDArray[np.float64]:
+    """Return the box round an object as it stands in `data`: (2, 3), its lowest and its highest corner in metres."""
     geoms = object_geoms(model, body)
     if len(geoms) == 0:
-        x, y, z = data.xpos[body].tolist()
-        return x, y, z
-    at, around = data.geom_xpos[geoms], model.geom_rbound[geoms, None]
-    x, y, z = ((at - around).min(axis=0) + (at + around).max(axis=0)).tolist()
-    return x / 2, y / 2, z / 2
+        return np.stack([data.xpos[body]] * 2)
+    turned = data.geom_xmat[geoms].reshape(-1, 3, 3)
+    middles, halves = np.split(model.geom_aabb[geoms], 2, axis=1)
+    at = data.geom_xpos[geoms] + np.einsum("gij,gj->gi", turned, middles)
+    halves = np.where(model.geom_rbound[geoms, None] > 0, halves, 0.0)  # planes have no end
+    around = np.einsum("gij,gj->gi", np.abs(turned), halves)
+    return np.stack([(at - around).min(axis=0), (at + around).max(axis=0)])
 
 
-def radius(model: mujoco.MjModel, data: mujoco.MjData, body: int, lookat: Point) -> float:
-    """Return how far from a point the farthest part of an object is, in metres."""
-    geoms = object_geoms(model, body)
-    far = np.linalg.norm(data.geom_xpos[geoms] - lookat, axis=1) + model.geom_rbound[geoms]
-    return float(max(far.tolist(), default=0.0))
+def centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Point:
+    """Return the middle of an object as it stands in `data`, in metres."""
+    x, y, z = extent(model, data, body).mean(axis=0).tolist()
+    return x, y, z
 
 
 def robot_side(model: mujoco.MjModel, data: mujoco.MjData, robot: Bodies, lookat: Point) -> NDArray[np.float64]:

@@ -131,6 +131,8 @@ def open_source(
     if episode_frames is None:
         raise BadInput(f"{dataset} shows no frames; give --frames FOLDER with a video of each episode")
     if masks:
+        if episode_frames.describe()["kind"] == "scene":
+            raise BadInput("--masks is for frames that show a robot (--frames, --camera), hidden here; leave it out")
         n_episodes = len(trajectories.n_steps)
         episode_frames = without_masked(episode_frames, [user_path(name) for name in masks], n_episodes, dataset)
     return Source(trajectories, episode_frames)

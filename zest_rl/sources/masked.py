@@ -55,6 +55,11 @@ class MaskedFrames:
                             f"{step} is {picture.shape[1]}×{picture.shape[0]}, the frame "
                             f"{frame.shape[1]}×{frame.shape[0]}; write masks of the stored frames"
                         )
+                    if picture.max() == 1 and self.masks.paths[0][episode].is_dir():  # a video may have noise
+                        raise BadInput(
+                            f"masks must be black and white (0 and 255), but that of frame {step} of episode {episode} "
+                            "holds 0 and 1; multiply by 255"
+                        )
                 yield frames, [picture.max(axis=-1) >= _WHITE for picture in pictures]
         except ValueError as error:
             if isinstance(error, BadInput):

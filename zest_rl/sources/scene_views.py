@@ -28,7 +28,7 @@ from zest_rl.sources.stage import SIZE, Simulation, env_facts, make_simulation
 from zest_rl.sources.states import versions
 from zest_rl.types import Frame
 
-VERSION = 1
+VERSION = 2
 """Raise it when a pixel changes, here or in simulation/: cached embeddings depend on it."""
 _WIDTHS = (7, 4, 1, 1)  # entries of qpos of a free joint, a ball, a slide and a hinge
 
@@ -111,7 +111,7 @@ class SceneViews:
     hidden: tuple[int, ...]
     """Bodies of the robot."""
     body: int
-    """That is looked at, where it stands in x_0."""
+    """That is looked at: the middle of its way, from where it stands in x_0."""
     ring: ObjectRing
     tolerance: float
     """See `zest_rl.simulation.scene.SceneConfig`."""

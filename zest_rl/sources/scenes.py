@@ -27,7 +27,7 @@ from zest_rl.simulation.bodies import (
     robot_bodies,
     subtree,
 )
-from zest_rl.simulation.framing import ObjectRing, azimuth_of, centre, object_geoms, radius, robot_side
+from zest_rl.simulation.framing import ObjectRing, azimuth_of, centre, extent, object_geoms, robot_side
 from zest_rl.simulation.rendering import Camera
 from zest_rl.simulation.scene import SceneConfig
 from zest_rl.sources.recorded_envs import Doubles, State
@@ -48,7 +48,7 @@ class SceneStates:
     hidden: tuple[int, ...]
     """Bodies of the robot."""
     body: int
-    """That is looked at, where it stands in x_0 of each episode."""
+    """That is looked at: the middle of its way, from where it stands in x_0 of each episode."""
     ring: ObjectRing
     tolerance: float
     """See `SceneConfig`."""
@@ -195,16 +195,18 @@ def _looked_at(model: mujoco.MjModel, config: SceneConfig, robot: Bodies, travel
 def _ring(
     simulation: Simulation, robot: Bodies, samples: Sequence[Sequence[State]], body: int, n_views: int
 ) -> ObjectRing:
-    """Return the views from the robot's side, as far away as the object and its way are large."""
+    """Return the views from the robot's side: of the box round the object and its way, as far away as that is large."""
     model, data = simulation.model, simulation.data
-    ways, radii = [], []
+    ways, boxes = [], []
     for sample in samples:
         simulation.put(sample[0])
-        lookat = centre(model, data, body)
-        ways.append(robot_side(model, data, robot, lookat))
-        farthest = 0.0
+        middle = centre(model, data, body)
+        ways.append(robot_side(model, data, robot, middle))
+        corners = []
         for state in sample:
             simulation.put(state)
-            farthest = max(farthest, radius(model, data, body, lookat))
-        radii.append(farthest)
-    return ObjectRing(azimuth_of(ways), float(np.quantile(radii, _EXTENT)), n_views)
+            corners.append(extent(model, data, body) - middle)
+        boxes.append([np.min(corners, axis=0)[0], np.max(corners, axis=0)[1]])
+    low, high = (np.quantile(boxes, share, axis=0)[side] for side, share in enumerate((1 - _EXTENT, _EXTENT)))
+    x, y, z = ((low + high) / 2).tolist()
+    return ObjectRing(azimuth_of(ways), float(np.linalg.norm(high - low) / 2), n_views, (x, y, z))

@@ -48,6 +48,11 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         command = _next_command(ds)
     if np.ptp(returns) == 0:
         ui.warn("all episodes have the same return: this goal and embedder tell nothing apart")
+    if relabeled.view_cannot_tell:
+        ui.warn(
+            "from the first to the last frames this view changes as much as the goal does, but in other directions: "
+            "one view that shows the robot cannot tell; hide the robot (recorded states, or --masks), or add views"
+        )
     return {
         "dataset": relabeled.dataset_id,
         "path": str(relabeled.path),
