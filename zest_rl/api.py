@@ -79,10 +79,11 @@ def relabel(dataset: AnyDataset, goal: str | Path = "same-scene", **flags: Any) 
 
     Args:
         dataset: any that `zest relabel` takes.
-        goal: folder with ``init/`` and ``goal/``, "text:closed drawer -> open drawer", or for the kitchen "same-scene",
-            "toys", "text" or "drawings".
-        **flags: frames, camera, views, show_robot, tolerance, skip_incomplete, embedder, features, similarity,
-            precision, goal_share, reward, shuffle, device, n_workers, engine, on_start, on_progress.
+        goal: folder with ``init/`` and ``goal/``, "text:closed drawer -> open drawer", "episode:3", or for the kitchen
+            "same-scene", "toys", "text" or "drawings".
+        **flags: frames, camera, env, robot, look_at, views, show_robot, tolerance, skip_incomplete, masks, embedder,
+            features, similarity, precision, goal_share, reward, shuffle, device, n_workers, engine, on_start,
+            on_progress. What `zest relabel --preview` draws, `zest_rl.rewards.preview.preview` draws.
     """
     from zest_rl.rewards.relabel import relabel as relabel_dataset
 
