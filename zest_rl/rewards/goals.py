@@ -126,7 +126,7 @@ def goal_folder(spec: str, task: Task) -> Path | None:
     if not is_there(folder):
         raise BadInput(
             f"unknown goal {spec!r}: it is neither {SAME_SCENE!r}, {TOYS!r}, {DRAWINGS!r}, '{VISUAL_TASKS}real_imgs', "
-            "'text', 'text:START -> GOAL', nor an existing folder with init/ and goal/"
+            "'text', 'text:START -> GOAL', 'episode:3', nor an existing folder with init/ and goal/"
         )
     return folder
 
@@ -206,7 +206,7 @@ def free_goal_folder(spec: str) -> Path | None:
         kitchen = f"{SAME_SCENE!r}, {TOYS!r}, {DRAWINGS!r} and 'text' are of zest/Kitchen-v1's tasks alone"
         raise BadInput(
             f"frames from elsewhere need a goal of their own, got {spec!r} ({kitchen}); give --goal a folder with "
-            "init/ and goal/ pictures, or 'text:closed drawer -> open drawer'"
+            "init/ and goal/ pictures, 'episode:3', or 'text:closed drawer -> open drawer'"
         )
     return folder
 
