@@ -43,7 +43,7 @@ def test_damaged_pictures_are_read_or_refused(kind: str, n: int) -> None:
     assert counts["refused"]
 
 
-@pytest.mark.parametrize("n", [60, pytest.param(3000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [30, pytest.param(3000, marks=pytest.mark.slow)])
 def test_damaged_jpeg_files_among_observations_are_read_or_refused(n: int) -> None:
     whole, rng = encoded("JPEG"), random.Random(0)
 

@@ -92,7 +92,7 @@ def test_a_scene_that_cannot_be_told_is_refused(blocks: str, make: str, options:
         ("pole", BadInput, "blocks:pole has no MuJoCo model to render; give --frames FOLDER"),
         ("meshless", ZestError, r"blocks:meshless cannot be made here .*gone\.stl"),
         ("sized", BadInput, r"sized\(size\) must be called without arguments"),
-        ("value", BadInput, "blocks has no function 'value'"),
+        ("value", BadInput, r"blocks \(.*blocks\.py\) has no function 'value'"),
         ("taller", BadInput, "body_pos must hold 12 numbers for blocks:taller, got 9; install the version"),
     ],
 )

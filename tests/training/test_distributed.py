@@ -34,7 +34,9 @@ def weights(run_dir: Path) -> dict[str, np.ndarray]:
     return load_file(run_dir / "model.safetensors")
 
 
-@pytest.mark.parametrize(("agent", "n_networks"), [("bc", 1), ("dt", 1), ("rvs", 2)])
+@pytest.mark.parametrize(
+    ("agent", "n_networks"), [pytest.param("bc", 1, marks=pytest.mark.slow), ("dt", 1), ("rvs", 2)]
+)
 def test_two_processes_train_what_one_does(agent: str, n_networks: int, collected: str, tmp_path: Path) -> None:
     words = [
         agent,
