@@ -414,7 +414,7 @@ def test_a_recipe_that_is_missing_or_no_toml_is_refused(tmp_path: Path) -> None:
     ("name", "verb", "path"),
     [
         ("demo", "reproduce", "eval/demo.toml"),
-        ("micro", "reproduce", "eval/micro.toml"),
+        ("table1_quick", "reproduce", "eval/table1_quick.toml"),
         ("micro", "collect", "datasets/micro.toml"),
         ("dt", "train dt", "train/dt.toml"),
         ("multistep", "follow kitchen", "eval/multistep.toml"),
