@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+
+import pytest
 
 RECIPE = """
 title = "A tiny comparison"
@@ -56,3 +59,21 @@ def write(folder: Path, text: str) -> Path:
     path = folder / "tiny.toml"
     path.write_text(text)
     return path
+
+
+def refuse_edited(
+    text: str,
+    edit: tuple[str, str],
+    refusal: Callable[..., tuple[int, str]],
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> tuple[Path, str]:
+    """Run a recipe with one edit in an empty folder; return its file, and the words with which it is refused."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
+    monkeypatch.setenv("ZEST_CACHE", str(folder / "cache"))
+    monkeypatch.delenv("ZEST_VISUAL_TASKS", raising=False)
+    assert text.count(edit[0]) == 1
+    recipe = write(folder, text.replace(*edit))
+    code, message = refusal("reproduce", recipe, "--output", folder / "out")
+    assert code == 2
+    return recipe, message

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tiny_comparison import RECIPE, TASK_AND_SIZE, write
+from tiny_comparison import RECIPE, TASK_AND_SIZE, refuse_edited, write
 
 from zest_rl.cli.reproduce.comparison import read_comparison
 
@@ -86,13 +86,7 @@ def test_a_bad_recipe_is_refused_before_anything_runs(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    monkeypatch.setenv("ZEST_CACHE", str(tmp_path / "cache"))
-    monkeypatch.delenv("ZEST_VISUAL_TASKS", raising=False)
-    assert RECIPE.count(old) == 1
-    recipe = write(tmp_path, RECIPE.replace(old, new))
-    code, message = refusal("reproduce", recipe, "--output", tmp_path / "out")
-    assert code == 2
+    recipe, message = refuse_edited(RECIPE, (old, new), refusal, tmp_path, monkeypatch)
     assert complaint in message
     assert str(recipe) in message
     assert list(tmp_path.iterdir()) == [recipe]

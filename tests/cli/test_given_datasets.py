@@ -11,7 +11,7 @@ import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
 import gymnasium
 import gymnasium_robotics  # noqa: F401  # registers its environments
 import pytest
-from tiny_comparison import write
+from tiny_comparison import refuse_edited, write
 
 from zest_rl.cli.reproduce.comparison import read_comparison
 from zest_rl.simulation.recorder import Recorder
@@ -77,12 +77,7 @@ def test_given_datasets_that_cannot_be_used_are_refused_before_anything_runs(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    monkeypatch.delenv("ZEST_VISUAL_TASKS", raising=False)
-    assert TWO.count(old) == 1
-    recipe = write(tmp_path, TWO.replace(old, new))
-    code, message = refusal("reproduce", recipe, "--output", tmp_path / "out")
-    assert code == 2
+    recipe, message = refuse_edited(TWO, (old, new), refusal, tmp_path, monkeypatch)
     assert complaint in message
     assert recipe.name in message
     assert not (tmp_path / "minari").exists()

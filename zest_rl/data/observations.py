@@ -141,6 +141,14 @@ def flatten(numeric: Mapping[str, NDArray[Any]]) -> FloatArray:
     return np.concatenate([column.reshape(len(column), -1) for column in columns], axis=1)
 
 
+def by_path(values: Any, prefix: str = "") -> dict[str, Any]:
+    """Return the entries of nested dictionaries by their keys with ``/`` between them."""
+    if not isinstance(values, Mapping):
+        return {prefix: values}
+    parts = (by_path(part, f"{prefix}/{name}".lstrip("/")) for name, part in values.items())
+    return {path: value for part in parts for path, value in part.items()}
+
+
 def observed(observations: Sequence[Any]) -> dict[str, NDArray[Any]]:
     """Stack the observations of n environments: (n, …) by the paths that they have in a file of Minari's."""
     first = observations[0]

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from zest_rl.data.folders import DATA_FILE, MANIFEST_FILE, METADATA_FILE, dataset_path, exists
 from zest_rl.data.hdf5 import open_hdf5
+from zest_rl.data.observations import by_path
 from zest_rl.data.reader import SOURCE_REWARD, Dataset
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
@@ -192,13 +193,6 @@ def _build_episodes(
         minari.create_dataset_from_buffers(dataset_id, buffers, env=spec, jpeg_encoding=False, **fields)
 
 
-def _flat(values: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
-    """Return the arrays of nested dictionaries by their paths."""
-    if not isinstance(values, Mapping):
-        return {prefix: values}
-    return {path: a for name, part in values.items() for path, a in _flat(part, f"{prefix}/{name}".lstrip("/")).items()}
-
-
 def write_episodes(
     dataset_id: str,
     episodes: Sequence[Mapping[str, Any]],
@@ -236,7 +230,7 @@ def write_episodes(
         raise BadInput(
             f"reference scores must be two finite numbers, that of 0 % below that of 100 %, or none, got {references}"
         )
-    arrays = [_flat({name: part for name, part in episode.items() if name != "seed"}) for episode in episodes]
+    arrays = [by_path({name: part for name, part in episode.items() if name != "seed"}) for episode in episodes]
     n_bytes = sum(array.nbytes for of_episode in arrays for array in of_episode.values())
     with _staged(dataset_id, 2 * n_bytes) as staging:
         write_in_child("the dataset", _build_episodes, staging / "root", dataset_id, episodes, env_spec, fields)

@@ -26,7 +26,7 @@ from zest_rl.data.env_specs import (
     check_registered,
     without_wrappers,
 )
-from zest_rl.data.observations import flatten, numeric_paths, observed
+from zest_rl.data.observations import by_path, flatten, numeric_paths, observed
 from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput, Notice, ZestError, nearest
 from zest_rl.kitchen.env import ENV_ID, env_spec
@@ -36,6 +36,7 @@ from zest_rl.simulation.makers import check_named, find_maker, named_by_user, so
 from zest_rl.simulation.recorder import DATA_FIELDS, MODEL_FIELDS, SUCCESS_KEYS
 from zest_rl.sources import state_plugins
 from zest_rl.sources.recorded_envs import recorded_env, running_state
+from zest_rl.sources.stage import env_facts
 from zest_rl.sources.states import versions
 from zest_rl.types import FloatArray
 
@@ -246,7 +247,7 @@ def _probed(made_by: str, meta: Mapping[str, Any], horizon: int | None, success_
         ) from error
     finally:
         env.close()
-    scenery = recorded_env(_entry_point(made_by), bare).scenery(bare)
+    scenery = recorded_env(str(env_facts(made_by).get("entry_point")), bare).scenery(bare)
     changed = [field for field, values in compiled.items() if not np.array_equal(values, after_reset[field])]
     placed = [path.rpartition("/")[2] for path in scenery] or changed
     fields = ("qpos", *placed, *DATA_FIELDS[1:])
@@ -263,10 +264,6 @@ def _probed(made_by: str, meta: Mapping[str, Any], horizon: int | None, success_
     )
 
 
-def _entry_point(made_by: str) -> str:
-    return made_by if MAKER.fullmatch(made_by) else str(_parsed(without_wrappers(made_by)).entry_point)
-
-
 def _model_fields(env: Any) -> dict[str, NDArray[np.float64]]:
     return running_state(env, MODEL_FIELDS)
 
@@ -276,7 +273,7 @@ def _success_key(env: gymnasium.Env[Any, Any], name: str, n_steps: int, given: s
     wanted, keys = (given,) if given is not None else SUCCESS_KEYS, dict[str, None]()
     for _ in range(n_steps):
         *_, terminated, truncated, info = env.step(env.action_space.sample())
-        keys |= dict.fromkeys(_paths(info))
+        keys |= dict.fromkeys(by_path(info))
         found = next((key for key in wanted if look_up(info, key) is not None), None)
         if found is not None:
             return found
@@ -292,15 +289,6 @@ def _success_key(env: gymnasium.Env[Any, Any], name: str, n_steps: int, given: s
         stacklevel=2,
     )
     return None
-
-
-def _paths(info: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Return the keys of ``info``, those of nested dictionaries with ``/`` between them."""
-    parts = [
-        _paths(value, f"{prefix}{key}/") if isinstance(value, Mapping) else [f"{prefix}{key}"]
-        for key, value in info.items()
-    ]
-    return [path for part in parts for path in part]
 
 
 def _check_spaces(
