@@ -96,6 +96,7 @@ SCORES = [np.array([0.0, 0.5, 1.0], np.float32), np.array([0.0, 0.1, 0.2], np.fl
         ("straight_in_time", 0.93, "nearly proportional to time"),
         ("saturated", 0.96, "most progress is not rewarded"),
         ("still", 0.95, "nothing moves, or the cameras do not see it"),
+        ("fallen", 0.6, "60% of the episodes end with a lower score than they began with"),
     ],
 )
 def test_each_degenerate_reward_has_its_warning(figure: str, value: float, expected: str) -> None:
@@ -129,6 +130,15 @@ def test_constant_scores_and_constant_returns_are_warned_of() -> None:
     assert reward_warnings([np.float32(0.999) + np.float32(8e-4) * score for score in SCORES], figures) == []
     alike = [np.array([0.0, 1.0], np.float32), np.array([1.0, 0.0], np.float32)]
     assert "same return" in reward_warnings(alike, figures)[0]
+
+
+def test_returns_that_follow_the_length_of_the_episode_are_warned_of() -> None:
+    figures = dict.fromkeys(NEED_NO_TRUTH, FINE)
+    longer = [np.full(length, 0.5, np.float32) + 0.1 * np.arange(length, dtype=np.float32) for length in (2, 5, 9)]
+    (warning,) = reward_warnings(longer, figures)
+    assert "Episodes are 2 to 9 steps long, and their returns follow the length (ρ = 1.00)" in warning
+    changes = [np.array(values, np.float32) for values in ([0.1, 0.4], [0.1] * 5, [0.05] * 8, [0.1] * 9, [0.0] * 10)]
+    assert reward_warnings(changes, figures) == []
 
 
 @pytest.mark.parametrize("views", [{"task": 7}, {"colour": 1}, {"size": "224"}, {"n_views": 1.5}])

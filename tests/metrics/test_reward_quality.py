@@ -140,6 +140,11 @@ def test_saturation_counts_both_ends() -> None:
     assert reward_quality.share_saturated([score] * 3).value == pytest.approx(0.9)
 
 
+def test_episodes_that_end_lower_than_they_began_are_counted() -> None:
+    score = np.array([0, 0.5, 0.1], np.float32)
+    assert reward_quality.share_fallen([score, score[::-1], -score, 0 * score]).value == pytest.approx(2 / 4)
+
+
 def test_frames_equal_to_the_first_show_nothing() -> None:
     still = np.array([True, True, False, True])
     assert reward_quality.share_unchanged([still, still[:2]]).value == pytest.approx((3 / 4 + 1) / 2)

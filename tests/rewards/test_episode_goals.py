@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from zest_rl.cli import main
 from zest_rl.data.images import read_image
 from zest_rl.errors import BadInput
 from zest_rl.rewards.episode_goals import episode_goal, read_source_goal, write_goal
@@ -76,3 +77,17 @@ def test_the_command_writes_goals_and_previews_before_anything_is_embedded(
     shown = zest("relabel", collected, "--goal", tmp_path / "goal", "--preview", tmp_path / "look.png")
     assert imageio.imread(shown["preview"]).ndim == 3
     assert not (tmp_path / "cache" / "embeddings").exists()
+
+
+def test_a_goal_that_the_episodes_lead_away_from_is_warned_of(
+    collected: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    folder, _ = write_goal(collected, 1, tmp_path / "goal")
+    words = ["relabel", collected, "--views", "1", "--tolerance", "0.05", "--n-workers", "1", "--goal"]
+    assert main([*words, str(folder)]) == 0
+    assert "end with a lower score" not in capsys.readouterr().err
+    (folder / "init").rename(folder / "was")
+    (folder / "goal").rename(folder / "init")
+    (folder / "was").rename(folder / "goal")
+    assert main([*words, str(folder)]) == 0
+    assert "75% of the episodes end with a lower score than they began with" in capsys.readouterr().err

@@ -12,7 +12,7 @@ import minari
 import numpy as np
 import pytest
 
-from zest_rl.errors import BadInput
+from zest_rl.errors import BadInput, Notice
 from zest_rl.simulation.recorder import Recorder
 from zest_rl.sources import open_source
 
@@ -81,6 +81,28 @@ def test_what_cannot_be_recorded_is_refused() -> None:
         Recorder(gymnasium.make("CartPole-v1"))
     with pytest.raises(BadInput, match="at least 1 episode with a step, got none"):
         Recorder(gymnasium.make("FetchPush-v4")).write("push/none-v0")
+
+
+class Nested(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Tells success in a dictionary of its own, as an array."""
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, _ = self.env.step(action)
+        return observation, reward, terminated, truncated, {"task": {"solved": np.array([False, True])}}
+
+
+def test_success_is_recorded_by_the_key_that_is_named_and_an_environment_that_no_file_can_name_is_told() -> None:
+    env = Recorder(Nested(gymnasium.make("FetchPush-v4")), success_key="task/solved")
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    with pytest.warns(Notice, match="push/nested-v0 cannot name its environment"):  # of the wrapper
+        env.write("push/nested-v0")
+    assert minari.load_dataset("push/nested-v0")[0].infos["success"].tolist() == [False, True]
+    env = Recorder(gymnasium.make("FetchPush-v4"), success_key="task/solved")
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    with pytest.raises(BadInput, match="by the key 'task/solved', but no info of 1 episodes has it"):
+        env.write("push/none-v0")
 
 
 @pytest.mark.parametrize("references", [{"ref_min_score": 0.0}, {"ref_min_score": 0.0, "ref_max_score": -50.0}])

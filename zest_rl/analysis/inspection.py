@@ -73,14 +73,13 @@ def inspect(dataset_id: str) -> Inspection:
         states = None if views is None else ds.states()
         truth = ds.truth() if ds.has_truth else None
     frames, still = None, None
-    after_actions = [episode[1:] for episode in scores]
     if views is not None and states is not None:
         rendered = [canonical_states(episode, views) for episode in states]
         frames = [episode[1:] for episode in rendered]
         still = [(episode[1:] == episode[0]).all(axis=1) for episode in rendered]
     elif (record.scorer.features, record.scorer.similarity) == ("delta", "cos") and record.shuffle is None:
-        still = [episode == 0 for episode in after_actions]  # nothing else scores exactly 0
-    figures = measure_rewards(rewards, after_actions, frames, still, truth)
+        still = [episode[1:] == 0 for episode in scores]  # nothing else scores exactly 0
+    figures = measure_rewards(rewards, scores, frames, still, truth)
     warnings = reward_warnings(rewards, figures)
     if record.shuffle is not None:
         warnings.insert(0, "These are the scores of other episodes: the dataset was relabeled with --shuffle.")

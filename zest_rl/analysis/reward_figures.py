@@ -12,8 +12,8 @@ from zest_rl.metrics import reward_quality, statistics
 from zest_rl.metrics.statistics import Estimate
 from zest_rl.types import FloatArray, GroundTruth
 
-CLOCK, STRAIGHT, SATURATED, STILL, CONTRADICTORY = 0.95, 0.9, 0.95, 0.9, 0.01
-"""Shares from which on a warning is given."""
+CLOCK, STRAIGHT, SATURATED, STILL, FALLEN, CONTRADICTORY, LENGTH = 0.95, 0.9, 0.95, 0.9, 0.5, 0.01, 0.8
+"""Shares from which on a warning is given; `LENGTH`: rank correlation of returns with the episodes' lengths."""
 FLAT = 1e-5
 """Scores whose range is at most this share of the largest count as constant up to rounding."""
 
@@ -56,6 +56,7 @@ FIGURES = (
     ),
     Figure("saturated", "Saturated", "share of rewards close to the lowest or the highest"),
     Figure("still", "Nothing to see", "share of frames that equal the first one"),
+    Figure("fallen", "Ends lower", "share of episodes whose last frame scores lower than their first"),
     Figure(
         "contradictory",
         "Contradictory",
@@ -81,34 +82,45 @@ def measure_rewards(
 
     Args:
         rewards: (T,) per episode, as a trainer gets them.
-        scores: (T,) per episode, of the frames after each action; equal to the rewards unless those are differences.
+        scores: (T+1,) per episode, of all frames; those after each action are the rewards unless these are differences.
         frames: (T, nq) states per episode after each action, rounded as for rendering; None outside the kitchen.
         still: (T,) per episode, whether the frame equals the first one; None where that is unknown.
         truth: ground truth per episode; None where there is none.
     """
+    after_actions = [episode[1:] for episode in scores]
     figures = {
         "value_order": reward_quality.value_order(rewards),
         "told_by_step": reward_quality.share_explained_by_step(rewards),
-        "straight_in_time": reward_quality.linear_trend_r2(scores),
+        "straight_in_time": reward_quality.linear_trend_r2(after_actions),
         "saturated": reward_quality.share_saturated(rewards),
+        "fallen": reward_quality.share_fallen(scores),
     }
     if still is not None:
         figures["still"] = reward_quality.share_unchanged(still)
     if frames is not None:
-        figures["contradictory"] = reward_quality.share_contradictory(scores, frames)
+        figures["contradictory"] = reward_quality.share_contradictory(after_actions, frames)
     if truth is not None:
         returns, targets = reward_quality.returns_of(rewards), true_returns(truth)
         figures |= {
             "spearman": statistics.spearman(returns, targets),
             "kendall": reward_quality.kendall(returns, targets),
             "pairwise": reward_quality.pairwise_accuracy(returns, targets),
-            "epic": reward_quality.epic_distance(scores, [episode.rewards for episode in truth]),
+            "epic": reward_quality.epic_distance(after_actions, [episode.rewards for episode in truth]),
         }
         told = [episode.success for episode in truth if episode.success is not None]
         if told:
             figures["auprc"] = reward_quality.average_precision(returns, np.array(told))
             figures["successes"] = statistics.wilson(sum(told), len(told))
     return figures
+
+
+def ends_lower(share: float) -> str:
+    """Return the warning of `FALLEN`."""
+    return (
+        f"{share:.0%} of the episodes end with a lower score than they began with: the goal is not what they lead to, "
+        "or some of its pictures mislead. Of many pictures, --goal-share 0.2 keeps those that the episodes end nearest "
+        "to."
+    )
 
 
 def reward_warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimate]) -> list[str]:
@@ -122,8 +134,16 @@ def reward_warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimat
     if np.ptp(values) <= FLAT * np.abs(values).max():
         return ["All frames score the same: this goal and embedder tell nothing apart. Look at the goal's pictures."]
     sentences = []
-    if np.ptp(reward_quality.returns_of(rewards)) == 0:
+    returns, lengths = reward_quality.returns_of(rewards), np.array([len(episode) for episode in rewards])
+    if np.ptp(returns) == 0:
         sentences.append("All episodes have the same return: there is nothing to condition a policy on.")
+    by_length = 0.0 if np.ptp(lengths) == 0 else statistics.spearman(returns, lengths, n_resamples=1).value
+    if abs(by_length) >= LENGTH:
+        sentences.append(
+            f"Episodes are {lengths.min()} to {lengths.max()} steps long, and their returns follow the length (ρ = "
+            f"{by_length:.2f}): a sum of levels rewards a long episode whatever it shows. Let all last equally long, "
+            "or reward the change of the score (--reward difference)."
+        )
     if "contradictory" in figures and figures["contradictory"].value >= CONTRADICTORY:
         sentences.append(
             f"{figures['contradictory'].value:.0%} of the frames score otherwise than an equal frame of the same "
@@ -142,6 +162,8 @@ def reward_warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimat
         sentences.append("Nearly all frames score next to the lowest or the highest: most progress is not rewarded.")
     if "still" in figures and figures["still"].value >= STILL:
         sentences.append("Most frames show what the first one shows: nothing moves, or the cameras do not see it.")
+    if figures["fallen"].value >= FALLEN:
+        sentences.append(ends_lower(figures["fallen"].value))
     rho = figures.get("spearman")
     if rho is not None and not rho.low > 0:  # also when it is NaN
         against = " The higher the return, the worse the episode." if rho.high < 0 else ""

@@ -92,24 +92,16 @@ class RunEnvironment:
 
         `reward` is None at the reset, at which only the kitchen tells one.
         """
-        at_reset = (look_up(info, "gt/reward") or 0.0) if self.is_kitchen else 0.0
+        at_reset = (by_path(info).get("gt/reward") or 0.0) if self.is_kitchen else 0.0
         told: dict[str, NDArray[Any]] = {"gt_reward": np.asarray(at_reset if reward is None else reward, np.float32)}
         if self.success_key is not None:
-            value = look_up(info, self.success_key)
+            value = by_path(info).get(self.success_key)
             told["gt_success"] = np.array(value is not None and bool(np.any(value)))
         return told | running_state(env.unwrapped, self.state)
 
 
 KITCHEN = RunEnvironment("", 1, "gt/success", ("qpos",), _KITCHEN_STEPS_PER_SECOND)
 """What a kept evaluation in zest/Kitchen-v1 says of it: there is nothing to choose."""
-
-
-def look_up(info: Mapping[str, Any], key: str) -> Any:
-    """Return an entry of ``info`` by its keys with ``/`` between them; None where it is not there."""
-    value: Any = info
-    for part in key.split("/"):
-        value = value.get(part) if isinstance(value, Mapping) else None
-    return value
 
 
 def act_in(env: gymnasium.Env[Any, Any], action: FloatArray) -> Any:
@@ -273,8 +265,9 @@ def _success_key(env: gymnasium.Env[Any, Any], name: str, n_steps: int, given: s
     wanted, keys = (given,) if given is not None else SUCCESS_KEYS, dict[str, None]()
     for _ in range(n_steps):
         *_, terminated, truncated, info = env.step(env.action_space.sample())
-        keys |= dict.fromkeys(by_path(info))
-        found = next((key for key in wanted if look_up(info, key) is not None), None)
+        told = by_path(info)
+        keys |= dict.fromkeys(told)
+        found = next((key for key in wanted if told.get(key) is not None), None)
         if found is not None:
             return found
         if terminated or truncated:

@@ -124,6 +124,15 @@ def share_unchanged(still: Sequence[NDArray[np.bool_]]) -> Estimate:
     return _mean_over_episodes([episode.mean() for episode in still])
 
 
+def share_fallen(scores: Sequence[FloatArray]) -> Estimate:
+    """Share of the episodes whose last frame scores lower than their first: they end farther from the goal.
+
+    Args:
+        scores: (T+1,) per episode, of x_0 … x_T.
+    """
+    return _mean_over_episodes([float(episode[-1] < episode[0]) for episode in scores])
+
+
 def share_contradictory(scores: Sequence[FloatArray], states: Sequence[NDArray[np.float64]]) -> Estimate:
     """Share of frames whose score differs from that of an equal state (T, nq) in the same episode. No ground truth.
 

@@ -6,6 +6,7 @@ robot. What an environment changes of its model is recorded, too, such as where 
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any, SupportsFloat
 
@@ -15,8 +16,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from zest_rl.data.observations import by_path
 from zest_rl.data.writer import write_episodes
-from zest_rl.errors import BadInput
+from zest_rl.errors import BadInput, Notice
 
 MODEL_FIELDS = ("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "geom_rgba", "mat_rgba")
 """Of a model, what an environment may change at its reset, so that frames depend on it."""
@@ -30,16 +32,22 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Records the episodes of a MuJoCo environment. Wrap before the first reset; an episode ends at the next reset.
 
     Alignment: `zest_rl.types`. ``infos/state`` gets qpos, qvel, the mocap bodies, and of the model what differs from
-    when it was wrapped; ``infos/success`` what the environment calls success or is_success.
+    when it was wrapped; ``infos/success`` what the environment calls success.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+    def __init__(self, env: gymnasium.Env[Any, Any], success_key: str | None = None) -> None:
         """Wrap an environment.
+
+        Args:
+            env: a MuJoCo environment.
+            success_key: entry of ``info`` that tells success, with ``/`` between keys of dictionaries in it; None: the
+                first of `SUCCESS_KEYS` that is there.
 
         Raises:
             BadInput: it has no MuJoCo model.
         """
         super().__init__(env)
+        self._success_key = success_key
         bare: Any = env.unwrapped
         self._bare = bare
         if not isinstance(getattr(bare, "model", None), mujoco.MjModel):
@@ -75,8 +83,9 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
                 state[name] = now.ravel().copy()
         episode.observations.append(_copied(observation))
         episode.states.append(state)
-        succeeded = next((info[name] for name in SUCCESS_KEYS if name in info), None)
-        episode.successes.append(None if succeeded is None else bool(succeeded))
+        keys = SUCCESS_KEYS if self._success_key is None else (self._success_key,)
+        succeeded = next((told for key in keys if (told := by_path(info).get(key)) is not None), None)
+        episode.successes.append(None if succeeded is None else bool(np.any(succeeded)))
 
     @property
     def recorded(self) -> list[_Episode]:
@@ -100,12 +109,26 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
             ref_max_score: return that counts as 100 %, such as an expert's; give both or none.
 
         Raises:
-            BadInput: nothing was recorded, the id is not ``namespace/name-vN``, or a dataset of this id exists.
+            BadInput: nothing was recorded, no ``info`` had the success_key, the id is not ``namespace/name-vN``, or a
+                dataset of this id exists.
             ZestError: the disk is full or read-only; nothing is left behind.
         """
         episodes = self.recorded
         if not episodes:
             raise BadInput("a dataset must have at least 1 episode with a step, got none; act in the environment first")
+        told = [success for episode in episodes for success in episode.successes if success is not None]
+        if self._success_key is not None and not told:
+            raise BadInput(
+                f"success is read from info by the key {self._success_key!r}, but no info of {len(episodes)} episodes "
+                "has it; write the keys of dictionaries in it as outer/inner"
+            )
+        if (env_spec := _storable(self.env.spec)) is None:
+            warnings.warn(
+                f"{dataset_id} cannot name its environment, which has no spec that a file can hold; where frames are "
+                "rendered from it, give a function that makes it: --env package.module:make",
+                Notice,
+                stacklevel=2,
+            )
         names = sorted({name for episode in episodes for state in episode.states for name in state})
         rest = {name: values.ravel() for name, values in self._compiled.items()}
         return write_episodes(
@@ -113,7 +136,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
             [episode.arrays(names, rest) for episode in episodes],
             observation_space=self.env.observation_space,
             action_space=self.env.action_space,
-            env_spec=_storable(self.env.spec),
+            env_spec=env_spec,
             description=description or f"Recorded in {self.env.spec.id if self.env.spec else self._bare}.",
             ref_min_score=ref_min_score,
             ref_max_score=ref_max_score,
@@ -158,8 +181,10 @@ def _stacked(rows: list[Any]) -> Any:
 
 
 def _storable(spec: gymnasium.envs.registration.EnvSpec | None) -> str | None:
-    """Return a spec as JSON; None where it has functions that no file can name."""
+    """Return a spec as JSON; None where it has functions or wrappers that no file can make again."""
+    if spec is None or callable(spec.entry_point) or any(w.kwargs is None for w in spec.additional_wrappers):
+        return None
     try:
-        return None if spec is None or callable(spec.entry_point) else spec.to_json()
+        return spec.to_json()
     except (TypeError, ValueError):
         return None

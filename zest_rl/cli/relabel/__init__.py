@@ -20,6 +20,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
     import numpy as np
 
+    from zest_rl.analysis.reward_figures import FALLEN, ends_lower
     from zest_rl.data.reader import open_dataset
     from zest_rl.rewards.preview import preview
     from zest_rl.rewards.relabel import relabel
@@ -45,9 +46,12 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         ui.say(f"{relabeled.dataset_id} is there already, nothing to do")
     with open_dataset(relabeled.dataset_id) as ds:
         returns = np.array([rewards.sum() for rewards in ds.rewards()])
+        fallen = np.mean([scores[-1] < scores[0] for scores in ds.scores()])
         command = _next_command(ds)
     if np.ptp(returns) == 0:
         ui.warn("all episodes have the same return: this goal and embedder tell nothing apart")
+    if fallen >= FALLEN:
+        ui.warn(f"{ends_lower(fallen)} `zest inspect` says more")
     if relabeled.view_cannot_tell:
         ui.warn(
             "from the first to the last frames this view changes as much as the goal does, but in other directions: "
