@@ -3,7 +3,7 @@ ZEST := .venv/bin/zest
 PYTEST := OMP_NUM_THREADS=1 .venv/bin/python -m pytest --durations=15
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow test-interop lint bench tables clean
+.PHONY: help setup demo test test-slow test-interop lint bench tables hero clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1|\2/' | column -t -s '|'
@@ -38,6 +38,9 @@ bench: setup ## compare speeds with other implementations
 
 tables: setup ## write the tables of README.md, docs/results.md and eval/README.md from eval/results
 	.venv/bin/python docs/tables.py
+
+hero: setup ## make the README's moving picture from runs/demo, the output of make demo
+	.venv/bin/python docs/hero.py
 
 clean: ## remove caches and builds; keeps .venv, .venvs, runs and datasets
 	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 import shutil
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from read_dataset import read
 from tiny_comparison import RECIPE, write
 
@@ -25,9 +27,12 @@ from zest_rl.cli.reproduce import code
 from zest_rl.cli.reproduce.cells import TaskDatasets, make_cells
 from zest_rl.cli.reproduce.comparison import read_comparison
 from zest_rl.data import reader
+from zest_rl.errors import BadInput
 from zest_rl.kitchen import calibration
 from zest_rl.report import methods
 from zest_rl.runtime import artifacts
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True)
@@ -111,6 +116,22 @@ def test_the_table_as_text_shows_every_row_and_goal(whole: Reproduced) -> None:
     of_task = {**whole.result["tasks"]["micro"], "spearman_of_zest_and_true_returns": {"scene": None}}
     undefined = reproduce.summary({**whole.result, "tasks": {"micro": of_task}})
     assert "true returns undefined" in undefined
+
+
+def test_the_moving_picture_shows_every_step_of_the_episode_that_scored_highest(
+    whole: Reproduced, tmp_path: Path
+) -> None:
+    hero = runpy.run_path(str(ROOT / "docs" / "hero.py"))
+    evaluation, index = hero["scored_highest"](whole.output)
+    hero["main"](whole.output, tmp_path / "hero.webp")
+    with Image.open(tmp_path / "hero.webp") as picture:
+        assert (picture.n_frames, picture.size) == (len(evaluation.traces["qpos"][index]), hero["SIZE"])
+        first = np.asarray(picture.convert("RGB"), int)
+        picture.seek(picture.n_frames - 1)
+        assert (np.asarray(picture.convert("RGB"), int) != first).mean() > 0.01
+    (tmp_path / "none").mkdir()
+    with pytest.raises(BadInput, match="holds no evaluation of a policy that is asked for returns"):
+        hero["main"](tmp_path / "none", tmp_path / "hero.webp")
 
 
 def test_a_second_run_finds_everything_done_and_says_so(
