@@ -39,7 +39,8 @@ bench: setup ## compare speeds with other implementations
 tables: setup ## write the tables of README.md, docs/results.md and eval/README.md from eval/results
 	.venv/bin/python docs/tables.py
 
-hero: setup ## make the README's moving picture from runs/demo, the output of make demo
+hero: setup ## make the README's pictures; the moving one is from runs/demo, the output of make demo
+	.venv/bin/python docs/task_sheet.py
 	.venv/bin/python docs/hero.py
 
 clean: ## remove caches and builds; keeps .venv, .venvs, runs and datasets

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+import runpy
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("*/README.md")})
@@ -42,3 +45,11 @@ def test_the_readme_has_120_lines_and_80_words_before_the_first_command() -> Non
     assert len(README.splitlines()) <= 120
     words = re.findall(r"\w+", re.sub(r"!\[.*?\]\(.*?\)", "", README.partition("```")[0]))
     assert len(words) <= 80
+
+
+def test_the_picture_of_the_tasks_is_what_its_script_makes(tmp_path: Path) -> None:
+    runpy.run_path(str(ROOT / "docs" / "task_sheet.py"))["main"](tmp_path / "tasks.webp")
+    with Image.open(tmp_path / "tasks.webp") as made, Image.open(ROOT / "docs" / "images" / "tasks.webp") as kept:
+        assert made.size == kept.size
+        differences = np.abs(np.asarray(made.convert("RGB"), int) - np.asarray(kept.convert("RGB"), int))
+    assert differences.mean() < 2, "drivers of GL draw edges differently"
