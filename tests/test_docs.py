@@ -1,9 +1,11 @@
-"""The README is short, and everything that a page links to exists."""
+"""The README is short, everything that a page links to exists, and what CONTRIBUTING.md shows fits the code."""
 
 from __future__ import annotations
 
 import re
 import runpy
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -36,9 +38,23 @@ def test_files_and_headings_that_a_page_links_to_exist(page: Path) -> None:
         assert not anchor or anchor in anchors(target.read_text(encoding="utf-8")), link
 
 
-def test_the_readme_leads_to_every_page_of_the_docs() -> None:
-    linked = {(ROOT / link.partition("#")[0]).resolve() for link in links(README)}
-    assert {page for page in PAGES if page.parent.name == "docs"} <= linked
+def test_the_site_leads_to_every_page_of_the_docs() -> None:
+    listed = set(re.findall(r": (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE))
+    assert {page.name for page in PAGES if page.parent.name == "docs"} <= listed
+
+
+def test_the_algorithm_embedder_and_source_of_the_contributing_page_fit_the_code(tmp_path: Path) -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    shutil.copytree(ROOT / "zest_rl", tmp_path / "zest_rl")
+    (copied,) = re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    subprocess.run(copied, shell=True, cwd=tmp_path, check=True)
+    diffs = re.findall(r"^```diff\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    assert len(diffs) == 3
+    for diff in diffs:
+        done = subprocess.run(["git", "apply"], cwd=tmp_path, input=diff, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+    for path in tmp_path.rglob("*.py"):
+        compile(path.read_text(encoding="utf-8"), path, "exec")
 
 
 def test_the_readme_has_120_lines_and_80_words_before_the_first_command() -> None:
