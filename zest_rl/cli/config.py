@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
-import sys
 import tomllib
 import types
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
-    Annotated,
     Any,
     Literal,
     NamedTuple,
@@ -19,12 +16,10 @@ from typing import (
     Union,
     get_args,
     get_origin,
-    get_type_hints,
 )
 
-import tyro
-from tyro.constructors import ConstructorRegistry, PrimitiveTypeInfo
-
+from zest_rl.cli.arguments import Argument, arguments_of, hyphenated
+from zest_rl.cli.help import print_help
 from zest_rl.errors import BadInput, nearest
 
 if TYPE_CHECKING:
@@ -33,10 +28,6 @@ if TYPE_CHECKING:
 C = TypeVar("C", bound="DataclassInstance")
 
 RECIPE_FOLDERS = ("datasets", "train", "eval")
-
-COMMON_FLAGS = """every verb also takes:
-  --recipe FILE.toml  defaults for the arguments, by name; flags win; NAME alone: a recipe of the package
-  --json              print the result as one JSON document on stdout"""
 
 
 def read_recipe(path: Path) -> dict[str, Any]:
@@ -69,15 +60,24 @@ def recipe_path(given: Path, verb: str) -> Path:
     Raises:
         BadInput: no recipe of that name comes with the package.
     """
-    from zest_rl.runtime.artifacts import shipped
-
     if len(given.parts) != 1 or given.suffix or given.is_file():
         return given
-    folder = {"collect": "datasets", "train": "train"}.get(verb.split()[0], "eval")
-    names = {path.stem for place in (Path(folder), shipped(folder)) for path in place.glob("*.toml")}
+    folder, names = _recipe_folder(verb), recipe_names(verb)
     if given.name not in names:
         raise BadInput(f"there is no recipe {given} in {folder}; {nearest(given.name, names)}")
     return Path(folder, f"{given}.toml")
+
+
+def recipe_names(verb: str) -> set[str]:
+    """Return the names of the recipes of a verb that are here or come with the package."""
+    from zest_rl.runtime.artifacts import shipped
+
+    folder = _recipe_folder(verb)
+    return {path.stem for place in (Path(folder), shipped(folder)) for path in place.glob("*.toml")}
+
+
+def _recipe_folder(verb: str) -> str:
+    return {"collect": "datasets", "train": "train"}.get(verb.split()[0], "eval")
 
 
 def expand_variables(path: Path) -> Path:
@@ -100,8 +100,8 @@ def load_config(config_class: type[C], recipe: Mapping[str, Any], source: str) -
             refuses a value.
     """
     values, problems = _read_table(config_class, recipe)
-    given = {_hyphenated(key) for key in recipe}
-    required = [_hyphenated(field) for field, argument in _arguments(config_class).items() if argument.is_required]
+    given = {hyphenated(key) for key in recipe}
+    required = [hyphenated(field) for field, argument in arguments_of(config_class).items() if argument.is_required]
     problems += [f"{key!r} is required" for key in required if key not in given]
     _refuse(problems, source)
     try:
@@ -134,8 +134,8 @@ def parse_config(config_class: type[C], argv: Sequence[str], verb: str) -> tuple
         values, recipe_problems = _read_table(config_class, recipe)
         _refuse(recipe_problems, f"recipe {path}")
     if asks_for_help is not None:
-        _print_help(config_class, verb, values)
-    arguments = _arguments(config_class)
+        print_help(config_class, verb, values)
+    arguments = arguments_of(config_class)
     missing = [field for field, argument in arguments.items() if argument.is_required and field not in values | given]
     positional = next((field for field in missing if not arguments[field].is_flag), None)
     if positional is not None and last in arguments and arguments[last].rule.nargs == "*":
@@ -145,55 +145,6 @@ def parse_config(config_class: type[C], argv: Sequence[str], verb: str) -> tuple
     wrong += [f"{arguments[field].name} is required{_taker(arguments[field], arguments, given)}" for field in missing]
     _refuse([*problems, *wrong], f"zest {verb}")
     return config_class(**values | flags), as_json is not None
-
-
-class _Argument(NamedTuple):
-    """A field of a config, as its user sees it."""
-
-    name: str
-    """``--flag``, or the placeholder of a positional argument."""
-    kind: Any
-    """The field's type."""
-    is_required: bool
-
-    @property
-    def rule(self) -> Any:
-        """Tyro's rule for that type: how many words, and what they stand for."""
-        return ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(self.kind, set()))
-
-    @property
-    def n_words(self) -> Sequence[int]:
-        """How many words its value may have, in ascending order."""
-        n = self.rule.nargs
-        return range(sys.maxsize) if n == "*" else sorted(n) if isinstance(n, tuple) else [n]
-
-    @property
-    def is_flag(self) -> bool:
-        """Whether it is given by name, not by position."""
-        return self.name.startswith("--")
-
-
-def _arguments(config_class: type[Any]) -> dict[str, _Argument]:
-    """Return a verb's arguments, by field."""
-    hints = get_type_hints(config_class, include_extras=True)
-    arguments = {}
-    for field in dataclasses.fields(config_class):
-        hint = hints[field.name]
-        kind, *extras = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-        placeholder = next((extra.metavar for extra in extras if hasattr(extra, "metavar")), field.name.upper())
-        name = placeholder if tyro.conf.Positional in extras else f"--{_hyphenated(field.name)}"
-        is_required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-        arguments[field.name] = _Argument(name, kind, is_required)
-    return arguments
-
-
-def _print_help(config_class: type[Any], verb: str, values: Mapping[str, Any]) -> None:
-    """Print the help of a verb, with `values` as the defaults, and exit."""
-    hints = get_type_hints(config_class, include_extras=True)
-    defaults = [(name, hints[name], dataclasses.field(default=value)) for name, value in values.items()]
-    with_defaults = dataclasses.make_dataclass("Config", defaults, bases=(config_class,), frozen=True, kw_only=True)
-    description = f"{config_class.__doc__}\n\n{COMMON_FLAGS}"
-    tyro.cli(with_defaults, args=["--help"], prog=f"zest {verb}", description=description)
 
 
 class _Words(NamedTuple):
@@ -209,7 +160,7 @@ class _Words(NamedTuple):
 
 def _split_words(config_class: type[Any], argv: Sequence[str]) -> _Words:
     """Sort the words of a command line by the arguments that they belong to; after ``--``, all are positional."""
-    arguments = _arguments(config_class)
+    arguments = arguments_of(config_class)
     flags: dict[str, tuple[str, int, list[str]]] = {  # what is given, by how many words at most, and which if by none
         "--recipe": ("--recipe", 1, []),
         "--json": ("--json", 0, []),
@@ -219,7 +170,7 @@ def _split_words(config_class: type[Any], argv: Sequence[str]) -> _Words:
     for field, argument in arguments.items():
         if argument.is_flag and argument.kind is bool:
             flags[argument.name] = field, 0, ["True"]
-            flags[f"--no-{_hyphenated(field)}"] = field, 0, ["False"]
+            flags[f"--no-{hyphenated(field)}"] = field, 0, ["False"]
         elif argument.is_flag:
             flags[argument.name] = field, argument.n_words[-1], []
     given: dict[str, list[str]] = {}
@@ -236,7 +187,7 @@ def _split_words(config_class: type[Any], argv: Sequence[str]) -> _Words:
             room = max(room - 1, 0)
             continue
         name, equals, value = word.partition("=")
-        name, room = _hyphenated(name), 0
+        name, room = hyphenated(name), 0
         if name not in flags:
             names = [argument.name for argument in arguments.values() if argument.is_flag]
             problems.append(f"unknown flag {name!r}; {nearest(name, names)}")
@@ -254,7 +205,7 @@ def _split_words(config_class: type[Any], argv: Sequence[str]) -> _Words:
     return _Words(given, [*problems, *(f"unexpected {word!r}" for word in positional)], last)
 
 
-def _taker(missing: _Argument, arguments: Mapping[str, _Argument], given: Mapping[str, Sequence[str]]) -> str:
+def _taker(missing: Argument, arguments: Mapping[str, Argument], given: Mapping[str, Sequence[str]]) -> str:
     """Name the flags whose lists may have taken the word of a missing positional argument."""
     lists = [
         f"{arguments[field].name} took {' '.join(given[field])!r}"
@@ -280,7 +231,7 @@ def _read_words(config_class: type[Any], given: Mapping[str, Sequence[str]]) -> 
     values: dict[str, Any] = {}
     problems: list[str] = []
     for field, words in given.items():
-        argument = _arguments(config_class)[field]
+        argument = arguments_of(config_class)[field]
         try:
             if len(words) not in argument.n_words:
                 raise ValueError
@@ -293,13 +244,13 @@ def _read_words(config_class: type[Any], given: Mapping[str, Sequence[str]]) -> 
 
 def _read_table(config_class: type[Any], recipe: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return the recipe's values, converted to the types of the config's fields, and all that is wrong with it."""
-    arguments = _arguments(config_class)
+    arguments = arguments_of(config_class)
     values: dict[str, Any] = {}
     problems: list[str] = []
     for key, value in recipe.items():
         field = key.replace("-", "_")
         if field not in arguments:
-            problems.append(f"unknown key {key!r}; {nearest(_hyphenated(key), map(_hyphenated, arguments))}")
+            problems.append(f"unknown key {key!r}; {nearest(hyphenated(key), map(hyphenated, arguments))}")
         elif field in values:
             problems.append(f"{key!r} is given twice, with '-' and with '_'")
         else:
@@ -357,7 +308,3 @@ def _describe(kind: Any) -> str:
     if origin is tuple:
         return "a list [" + ", ".join(_describe(arg) for arg in args) + "]"
     return {str: "a string", Path: "a path (string)", int: "an integer", float: "a number", bool: "true or false"}[kind]
-
-
-def _hyphenated(name: str) -> str:
-    return name.replace("_", "-")

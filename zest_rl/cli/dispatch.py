@@ -11,10 +11,11 @@ from typing import Any
 
 from zest_rl import __version__
 from zest_rl.cli.config import parse_config
+from zest_rl.cli.help import command_help, sub_verb_help
 from zest_rl.cli.notices import notices_by
 from zest_rl.cli.output import print_result
 from zest_rl.cli.terminal import StreamUi
-from zest_rl.cli.verbs import HELP, VERBS, sub_verb_help
+from zest_rl.cli.verbs import VERBS
 from zest_rl.errors import BadInput, nearest
 
 
@@ -22,10 +23,15 @@ def dispatch(words: list[str]) -> int:
     """Run what `words` ask for, and return the exit code."""
     first, *rest = words or [""]
     if not words or first in ("-h", "--help", "help"):
-        print(HELP, file=sys.stdout if words else sys.stderr)
+        print(command_help(), file=sys.stdout if words else sys.stderr)
         return 0 if words else 2
     if first == "--version":
         print(f"zest {__version__}")
+        return 0
+    if first == "--completion":
+        from zest_rl.cli.completion import completion
+
+        print(completion(rest[0] if rest else ""))
         return 0
     if first.startswith("-"):
         raise BadInput(f"the verb comes first: zest VERB {first}; verbs: {', '.join(VERBS)}")

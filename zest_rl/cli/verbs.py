@@ -1,11 +1,8 @@
-"""The verbs of ``zest``, and the help that lists them."""
+"""The verbs of ``zest``; of each, the flags that most people need and an example or two."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-from zest_rl.cli.config import COMMON_FLAGS
+from typing import NamedTuple
 
 VERBS = {
     "doctor": "check versions, rendering, weights and disk; say how to fix each",
@@ -16,37 +13,68 @@ VERBS = {
     "select": "datasets and a goal → does the goal find its frames (`goals`), `actions`, real `footage`?",
     "follow": "an episode that reaches several goals → its similarity to each of them over time",
     "export": "a dataset → a file that other offline-RL code reads",
-    "train": "a dataset → a policy, by `bc` or `dt`",
+    "train": "a dataset → a policy; `zest train --help` lists the algorithms",
     "adopt": "a policy that another program trained → a run folder, as `train` leaves one",
     "evaluate": "a policy → returns and success in MuJoCo, with videos",
     "reproduce": "a recipe → a whole table or figure, cell by cell; rerun it to resume",
     "report": "results → one HTML file",
 }
 
-HELP = """usage: zest VERB [arguments]
 
-A picture or a sentence as the reward function for offline robot learning:
-goal spec + frames → embeddings → scores → relabeled dataset → trainer → policy → evaluation → report
+class Usage(NamedTuple):
+    """How most people use a verb."""
 
-verbs (`zest VERB --help` lists the arguments of one):
-{verbs}
-
-{common}
-
-also: --help, --version
-
-exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted by Ctrl-C and 143 by SIGTERM (run the same command again to
-go on; a second signal ends a command at once)
-
-examples:
-  zest doctor
-  zest collect --task micro
-  zest reproduce eval/demo.toml""".format(
-    verbs="\n".join(f"  {verb:<10} {summary}" for verb, summary in VERBS.items()), common=COMMON_FLAGS
-)
+    first: tuple[str, ...]
+    """The fields that help lists before the advanced ones."""
+    examples: tuple[str, ...]
+    """What may follow ``zest VERB``."""
 
 
-def sub_verb_help(verb: str, configs: Mapping[str, type[Any]]) -> str:
-    """List the sub-verbs of a verb."""
-    lines = [f"  {name:<10} {(config.__doc__ or '').splitlines()[0]}" for name, config in configs.items()]
-    return "\n".join([f"usage: zest {verb} SUB-VERB [arguments]", "", *lines, "", f"`zest {verb} SUB-VERB --help`"])
+USAGES = {
+    "doctor": Usage((), ("", "--json")),
+    "collect": Usage(("task", "n_episodes", "seed", "dataset"), ("--task micro", "--recipe mixed --task sdoor")),
+    "goal": Usage(("episode", "output"), ("zest/kitchen-micro-noisy-v0 --episode 3", "door.mp4 --output door/")),
+    "relabel": Usage(
+        ("goal", "frames", "embedder", "preview"),
+        (
+            "zest/kitchen-micro-noisy-v0 --goal same-scene",
+            "door/mine-v0 --frames observations/image --goal pictures/",
+            "door/mine-v0 --frames observations/image --goal pictures/ --preview seen.png",
+        ),
+    ),
+    "inspect": Usage(("output",), ("zest/kitchen-micro-noisy-zest-0a1b2c3d-v0",)),
+    "select goals": Usage(
+        ("task", "goal", "embedder", "top", "context"), ("zest/kitchen-micro-noisy-v0 --goal same-scene",)
+    ),
+    "select actions": Usage(
+        ("task", "goal", "embedder", "top"), ("zest/kitchen-micro-noisy-v0 zest/kitchen-sdoor-noisy-v0 --goal toys",)
+    ),
+    "select footage": Usage(
+        ("goals", "ask", "pool", "embedder", "top"), ("clips/", "clips/ --goals rendered/ --pool all")
+    ),
+    "follow kitchen": Usage(("goal", "output"), ("sdoor knob3 micro",)),
+    "follow video": Usage(
+        ("goals", "embedder", "output"),
+        ("dinner.mp4 --goals cupboard_open.png cup_out.png", "dinner.mp4 --goals cupboard/ cup/ --output dinner.html"),
+    ),
+    "export": Usage(("to", "output"), ("zest/kitchen-micro-noisy-v0 --to d3rlpy",)),
+    "train": Usage(
+        ("n_updates", "batch_size", "seed", "device", "run_dir"),
+        ("zest/kitchen-micro-noisy-v0", "zest/kitchen-micro-noisy-v0 --n-updates 2000 --seed 1"),
+    ),
+    "adopt": Usage(
+        ("dataset", "name", "run_dir"), ('torchscript:iql.pt --dataset zest/kitchen-micro-noisy-v0 --name "IQL, mine"',)
+    ),
+    "evaluate": Usage(
+        ("n_episodes", "seed", "env", "videos"),
+        ("runs/kitchen-micro-noisy-v0-bc-seed0", "runs/kitchen-micro-noisy-v0-bc-seed0 --n-episodes 20 --no-videos"),
+    ),
+    "reproduce": Usage(("output", "n_workers"), ("demo", "eval/table1_quick.toml --output runs/mine")),
+    "report": Usage(("output", "title"), ("runs/bc-seed0 runs/bc-seed1 runs/dt-seed0 runs/dt-seed1",)),
+}
+"""By the verb, with its sub-verb where their flags differ."""
+
+
+def usage(verb: str) -> Usage | None:
+    """Return how most people use ``zest VERB``, if that is known."""
+    return USAGES.get(verb, USAGES.get(verb.split()[0]))

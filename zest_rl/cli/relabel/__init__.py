@@ -8,7 +8,6 @@ from zest_rl.cli.relabel.arguments import Config
 from zest_rl.cli.ui import Ui, progress_in_parts
 
 if TYPE_CHECKING:
-    from zest_rl.data.reader import Dataset
     from zest_rl.sources import Source
 
 __all__ = ["Config", "run"]
@@ -47,7 +46,6 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     with open_dataset(relabeled.dataset_id) as ds:
         returns = np.array([rewards.sum() for rewards in ds.rewards()])
         fallen = np.mean([scores[-1] < scores[0] for scores in ds.scores()])
-        command = _next_command(ds)
     if np.ptp(returns) == 0:
         ui.warn("all episodes have the same return: this goal and embedder tell nothing apart")
     if fallen >= FALLEN:
@@ -67,18 +65,5 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "return_min": float(returns.min()),
         "return_max": float(returns.max()),
         "seconds": round(time.monotonic() - started, 2),
-        "next": command,
+        "next": f"zest inspect {relabeled.dataset_id}",
     }
-
-
-def _next_command(ds: Dataset) -> str:
-    """Name a command that works on what a dataset observes and how it acts."""
-    import numpy as np
-
-    from zest_rl.data.observations import acts_discretely, entries, is_numbers
-
-    groups = list(ds.groups.values())
-    if not any(map(is_numbers, entries(groups[0]["observations"]).values())):
-        return f"zest inspect {ds.id}"
-    trains = all(not acts_discretely(group) and np.abs(group["actions"][()]).max() <= 1 for group in groups)
-    return f"zest train dt {ds.id}" if trains else f"zest export {ds.id} --to npz"
