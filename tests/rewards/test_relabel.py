@@ -169,6 +169,13 @@ def test_the_scorer_beside_the_data_scores_them_as_they_were_scored(relabeled: R
         np.testing.assert_array_equal(scorer.score_episode(states), scores)
 
 
+def test_a_card_lies_beside_the_data_and_readers_may_add_to_it(relabeled: Relabeled) -> None:
+    card = relabeled.path / "README.md"
+    assert relabeled.scorer.record.embedder_sha256 in card.read_text(encoding="utf-8")
+    card.write_text(card.read_text(encoding="utf-8") + "Recorded on a Tuesday.\n", encoding="utf-8")
+    assert read(relabeled.dataset_id, Dataset.scores)
+
+
 def test_small_pictures_of_the_goal_lie_beside_the_data(relabeled: Relabeled) -> None:
     pictures = sorted(p.relative_to(relabeled.path) for p in (relabeled.path / GOAL_FOLDER).rglob("*.png"))
     assert pictures == [Path(GOAL_FOLDER, "goal", "0.png"), Path(GOAL_FOLDER, "init", "0.png")]

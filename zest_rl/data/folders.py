@@ -15,6 +15,8 @@ from zest_rl.runtime import artifacts
 
 DATASET_ID = re.compile(r"(?:[A-Za-z0-9][\w.-]+/)*[A-Za-z0-9][\w.-]*-v\d+")
 DATA_FILE, METADATA_FILE, MANIFEST_FILE = "data/main_data.hdf5", "data/metadata.json", "zest_manifest.json"
+CARD_FILE = "README.md"
+"""For readers, who may add to it: not in the manifest."""
 
 
 def datasets_root() -> Path:

@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.data.folders import DATA_FILE, MANIFEST_FILE, METADATA_FILE, dataset_path, exists
+from zest_rl.data.folders import CARD_FILE, DATA_FILE, MANIFEST_FILE, METADATA_FILE, dataset_path, exists
 from zest_rl.data.hdf5 import open_hdf5
 from zest_rl.data.observations import by_path
 from zest_rl.data.reader import SOURCE_REWARD, Dataset
@@ -74,7 +74,7 @@ def _seal(staging: Path, dataset_id: str, expected: Iterable[Mapping[str, NDArra
                     raise ZestError(f"{name} of episode {i} of {dataset_id} was not written whole; is the disk full?")
         if len(file) != n_expected:
             raise ZestError(f"{len(file)} of {n_expected} episodes of {dataset_id} were written; try again")
-    files = [path for path in sorted(staging.rglob("*")) if path.is_file()]
+    files = [path for path in sorted(staging.rglob("*")) if path.is_file() and path.name != CARD_FILE]
     digests = {path.relative_to(staging).as_posix(): artifacts.hash_file(path) for path in files}
     artifacts.write_json(staging / MANIFEST_FILE, digests)
 

@@ -12,11 +12,13 @@ import numpy as np
 from PIL import Image
 
 from zest_rl.data import reader
+from zest_rl.data.folders import CARD_FILE
 from zest_rl.data.provenance import RelabelRecord
 from zest_rl.data.writer import write_scored
 from zest_rl.embedders import DEFAULT_EMBEDDER, Precision
 from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.views import Views
+from zest_rl.rewards.cards import dataset_card
 from zest_rl.rewards.embeddings import EpisodeEmbeddings
 from zest_rl.rewards.episode_goals import read_source_goal
 from zest_rl.rewards.frame_embeddings import FrameEmbeddings
@@ -218,6 +220,11 @@ def relabel_source(
             n_still_frames=n_still,
             provenance=artifacts.provenance(),
         )
+
+        def add(folder: Path) -> None:
+            artifacts.write_bytes(folder / CARD_FILE, dataset_card(target_id, record, scores).encode())
+            _write_scorer(folder, scorer, source.frames)
+
         write_scored(
             trajectories,
             target_id,
@@ -226,7 +233,7 @@ def relabel_source(
             description=f"Rewards are scores ({config.similarity}+{config.features}, {reward}) "
             f"by {masked(config.embedder)}.",
             zest={"relabel": record.to_json()},
-            extra=lambda folder: _write_scorer(folder, scorer, source.frames),
+            extra=add,
         )
         of_pictures = scorer.goal is not None and not scorer.goal.is_text
         is_masked = isinstance(source.frames, KitchenStates | SceneStates | MaskedFrames)

@@ -20,8 +20,10 @@ import torch
 
 from zest_rl.agents import foreign
 from zest_rl.agents.base import describe_data
+from zest_rl.data.folders import CARD_FILE
 from zest_rl.data.reader import open_dataset
 from zest_rl.errors import BadInput
+from zest_rl.rewards.cards import policy_card
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.privacy import masked
 from zest_rl.runtime.trust import remember
@@ -107,6 +109,7 @@ def adopt(
             _try(foreign.load(staging, request, torch.device("cpu")), episodes[:N_TRIED])
             told = {"max_steps": facts.max_steps, "made_by": artifacts.provenance()}
             artifacts.write_json(staging / "meta.json", request | told)
+            artifacts.write_bytes(staging / CARD_FILE, policy_card(request).encode())
     return run_dir
 
 

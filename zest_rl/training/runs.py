@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from zest_rl.agents import get_agent
+from zest_rl.data.folders import CARD_FILE
 from zest_rl.data.reader import Dataset, open_dataset
+from zest_rl.rewards.cards import policy_card
 from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.runtime import artifacts
 from zest_rl.training.checkpoints import snapshots
@@ -52,6 +54,8 @@ def train(
         for folder, (name, content) in product((run_dir, *snapshots(run_dir)), files.items()):
             if not (folder / name).exists():  # earlier versions wrote it when all else was there
                 artifacts.write_bytes(folder / name, content)
+        if not (run_dir / CARD_FILE).exists():
+            artifacts.write_bytes(run_dir / CARD_FILE, policy_card(artifacts.read_json(run_dir / "meta.json")).encode())
     return run_dir
 
 
