@@ -15,6 +15,8 @@ from read_dataset import read
 from tests.conftest import collect_some
 from zest_rl.analysis.cross_task import Confusion, confusion, confusion_warnings
 from zest_rl.analysis.inspection import inspect
+from zest_rl.analysis.verdict import Verdict
+from zest_rl.cli import inspect as inspect_verb
 from zest_rl.data.reader import Dataset
 from zest_rl.kitchen import scene
 from zest_rl.kitchen.views import Views
@@ -118,13 +120,29 @@ def test_the_verb_prints_figures_warns_and_leaves_a_page(
     shuffled = relabel_source(kitchen_source(collected, VIEWS), CONFIG, shuffle=0, n_workers=1).dataset_id
     result = zest("inspect", scored, shuffled, "--output", tmp_path / "page.html")
     assert set(result["datasets"]) == {scored, shuffled}
-    figure = result["datasets"][scored]["figures"]["Value-order correlation"]
+    figure = result["datasets"][scored]["figures"]["value_order"]
     assert figure["ci95"][0] <= figure["value"] <= figure["ci95"][1]
+    verdicts = [result["verdicts"][dataset] for dataset in (scored, shuffled)]
+    assert [verdict["advice"] for verdict in verdicts] == ["too few episodes to tell", "do not"]
+    assert verdicts[1]["why"] == "these are the scores of other episodes"
+    said = inspect_verb.summary(result).splitlines()
+    assert said[0] == f"{scored}: {Verdict.from_json(verdicts[0])}", "the verdict comes first"
+    assert "R² of a linear trend. Of score over time in an episode; 1 is proportional to time." in "\n".join(said)
     assert any("shuffled?" in warning for warning in result["warnings"][shuffled])
     assert not any("shuffled?" in warning for warning in result["warnings"][scored])
     assert result["goals_against_tasks"] is None, "both are of one task"
     page = (tmp_path / "page.html").read_text()
     assert page.count('class="strip"') == 2, "best and worst; the shuffled scores are not those of what is seen"
-    for heading in ("Warnings", "Reward quality", "Ranking", "Frames", "Views", "Pixels", "Scores over time"):
+    assert page.index("these are the scores of other episodes") < page.index("<h2>Warnings</h2>")
+    for heading in (
+        "Verdict",
+        "Warnings",
+        "Reward quality",
+        "Ranking",
+        "Frames",
+        "Views",
+        "Pixels",
+        "Scores over time",
+    ):
         assert f"<h2>{heading}</h2>" in page
     json.dumps(result, allow_nan=False)

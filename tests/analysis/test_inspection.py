@@ -15,6 +15,7 @@ from tiny_dataset import COLLECTED
 from zest_rl.analysis.cross_task import inspect_datasets
 from zest_rl.analysis.inspection import Inspection, inspect, labels
 from zest_rl.analysis.reward_figures import FIGURES, reward_warnings
+from zest_rl.analysis.verdict import Verdict
 from zest_rl.data import reader
 from zest_rl.data.provenance import RelabelRecord, ScorerRecord
 from zest_rl.data.reader import Dataset
@@ -159,7 +160,8 @@ def test_differences_are_judged_as_the_trainer_sees_them(collected: str, scored:
     truth = np.array([episode.episode_return for episode in read(differences, Dataset.truth)])
     assert found.figures["spearman"].value == pytest.approx(statistics.spearman(last, truth).value)
     assert found.figures["contradictory"].value == 0, "levels repeat where states do, differences need not"
-    assert found.figures["value_order"] != level.figures["value_order"]
+    assert found.figures["value_order"] == level.figures["value_order"], "scores rise, whatever is made of them"
+    assert found.figures["told_by_step"] != level.figures["told_by_step"]
     assert labels([found, level]) == ["micro by same-scene, reward difference", "micro by same-scene, reward level"]
 
 
@@ -173,7 +175,7 @@ def test_labels_tell_what_differs() -> None:
         return RelabelRecord(**{"source": "", "source_sha256": "", "reward": "level", "scorer": scorer, **of_rewards})
 
     def named(*records: RelabelRecord) -> list[str]:
-        nothing = ({}, (), {}, np.zeros(0), None, (0.0, 1.0), None)
+        nothing = (Verdict("do not", "", {}), {}, (), {}, np.zeros(0), None, (0.0, 1.0), None)
         return labels([Inspection(f"zest/{i}", "micro", record, *nothing) for i, record in enumerate(records)])
 
     assert named(made()) == ["micro by same-scene"]

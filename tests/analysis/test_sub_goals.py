@@ -12,9 +12,11 @@ import pytest
 from PIL import Image
 
 from zest_rl.analysis.sub_goals import SubGoalScores, rise_in_order
+from zest_rl.cli import follow
 from zest_rl.kitchen.env import KitchenEnv
 from zest_rl.kitchen.tasks import TASKS
 from zest_rl.kitchen.views import Views
+from zest_rl.report.sub_goal_page import sub_goal_report
 
 Zest = Callable[..., dict[str, Any]]
 Refusal = Callable[..., tuple[int, str]]
@@ -40,6 +42,17 @@ def test_a_score_rises_when_it_is_half_way_to_its_highest() -> None:
     assert rise_in_order([scored([0, 1, 0]), scored([0, 0, 1])])
     assert not rise_in_order([scored([0, 0, 1]), scored([0, 1, 0])])
     assert not rise_in_order([scored([0, 0, 1]), scored([0, 0, 1])]), "at once is not one after another"
+
+
+@pytest.mark.parametrize("scores", [np.full(30, 0.2), np.random.default_rng(0).normal(0.1, 0.05, 60)])
+def test_a_flat_curve_is_no_signal_rather_than_in_order(scores: np.ndarray) -> None:
+    flat = scored([0.0, *scores])
+    assert not flat.has_signal
+    assert flat.rises_at is None
+    page = sub_goal_report([flat], {})
+    assert page.summary == "There is no signal, as no score tells anything of the next: goal no signal."
+    result = {"sub_goals": {"goal": flat.as_json()}, "in_order": rise_in_order([flat]), "report": "follow.html"}
+    assert follow.summary(result).splitlines()[1] == "in the order of the sub-goals: no signal"
 
 
 def test_in_the_kitchen_the_similarity_to_each_task_rises_as_it_is_done(zest: Zest, tmp_path: Path) -> None:

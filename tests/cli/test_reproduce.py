@@ -403,10 +403,10 @@ def test_a_recipe_without_methods_ends_with_what_its_rewards_are_worth(
     result = zest("reproduce", write(tmp_path, without_methods), "--output", tmp_path / "out", "--n-workers", "1")
     (dataset,) = result["datasets"]
     assert read(dataset, lambda ds: ds.metadata)["zest"]["relabel"]["source"] == "zest/kitchen-micro-whole-v0"
-    assert "Spearman ρ" in next(iter(result["datasets"].values()))["figures"]
+    assert "spearman" in next(iter(result["datasets"].values()))["figures"]
     assert json.loads((tmp_path / "out" / "result.json").read_text())["datasets"] == result["datasets"]
     assert "Views" in (tmp_path / "out" / "report.html").read_text()
-    assert "Spearman ρ" in reproduce.summary(result)
+    assert "Rank correlation with the true returns" in reproduce.summary(result)
     nothing = without_methods[: without_methods.index("[goals.scene]")]
     code, message = refusal("reproduce", write(tmp_path, nothing))
     assert (code, "at least 1 method, or 1 goal to inspect" in message) == (2, True)

@@ -97,10 +97,10 @@ def test_policies_are_trained_on_it_it_is_exported_and_inspected_and_not_evaluat
     inspected = zest("inspect", made, "--output", tmp_path / "page.html")
     figures = inspected["datasets"][made]["figures"]
     assert figures.keys() == {
-        "Value-order correlation", "Told by the step", "Straight in time", "Saturated", "Nothing to see",
-        "Spearman ρ", "Kendall τ-b", "Pairwise accuracy", "EPIC distance",  # by the rewards that the dataset came with
+        "value_order", "told_by_step", "straight_in_time", "saturated", "still", "fallen",
+        "spearman", "kendall", "pairwise", "epic",  # by the rewards that the dataset came with
     }  # fmt: skip
     still = [score[1:] == 0 for score in read(made, Dataset.scores)]
     assert sum(map(np.sum, still)) == read(made, lambda ds: ds.metadata)["zest"]["relabel"]["n_still_frames"]
-    assert figures["Nothing to see"]["value"] == pytest.approx(np.mean([episode.mean() for episode in still]))
+    assert figures["still"]["value"] == pytest.approx(np.mean([episode.mean() for episode in still]))
     assert made in (tmp_path / "page.html").read_text()

@@ -12,6 +12,7 @@ import numpy as np
 from zest_rl.analysis.episode_view import EpisodeView, best_and_worst
 from zest_rl.analysis.inspection import Inspection, inspect, labels
 from zest_rl.analysis.reward_figures import FIGURES
+from zest_rl.analysis.verdict import Verdict
 from zest_rl.data.reader import dataset_path
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.metrics.statistics import bootstrap
@@ -103,9 +104,12 @@ def confusion_warnings(inspections: Sequence[Inspection], compared: Confusion) -
     return warnings
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class JointInspection:
-    """Inspections of several datasets, and their comparison where they are of several tasks."""
+    """Inspections of several datasets, and their comparison where they are of several tasks.
+
+    Its `repr` is the verdict and the warnings of each dataset.
+    """
 
     inspections: tuple[Inspection, ...]
     views: Mapping[str, Mapping[str, EpisodeView]]
@@ -117,9 +121,21 @@ class JointInspection:
     left_out: tuple[str, ...]
     """Sentences on what could not be rendered or compared, and why."""
 
+    @property
+    def verdicts(self) -> dict[str, Verdict]:
+        """Whether to train on each dataset, and why."""
+        return {inspection.dataset_id: inspection.verdict for inspection in self.inspections}
+
+    def __repr__(self) -> str:
+        lines = []
+        for dataset, verdict in self.verdicts.items():
+            lines += [f"{dataset}: {verdict}", *(f"  warning: {sentence}" for sentence in self.warnings[dataset])]
+        return "\n".join(lines)
+
     def to_json(self) -> dict[str, Any]:
         """Return the output of `zest inspect --json`."""
         return {
+            "verdicts": {dataset: verdict.to_json() for dataset, verdict in self.verdicts.items()},
             "datasets": {
                 inspection.dataset_id: {"label": label, "figures": _figures_to_json(inspection)}
                 for label, inspection in zip(labels(self.inspections), self.inspections, strict=True)
@@ -138,8 +154,8 @@ class JointInspection:
 
 def _figures_to_json(inspection: Inspection) -> dict[str, Any]:
     estimates = inspection.known_figures()
-    known = [(figure.label, estimates[figure.key]) for figure in FIGURES if figure.key in estimates]
-    return {label: None if estimate is None else estimate.as_json() for label, estimate in known}
+    known = [(figure.key, estimates[figure.key]) for figure in FIGURES if figure.key in estimates]
+    return {key: None if estimate is None else estimate.as_json() for key, estimate in known}
 
 
 def inspect_datasets(

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.analysis.reward_figures import measure_rewards, reward_warnings, true_returns
+from zest_rl.analysis.reward_figures import VIEW_CANNOT_TELL, measure_rewards, reward_warnings, true_returns
+from zest_rl.analysis.verdict import Verdict, judge
 from zest_rl.data.folders import METADATA_FILE
 from zest_rl.data.provenance import RelabelRecord
 from zest_rl.data.reader import open_dataset
@@ -25,13 +26,14 @@ from zest_rl.types import FloatArray, GroundTruth
 
 @dataclass(frozen=True)
 class Inspection:
-    """The figures and warnings of one dataset's rewards."""
+    """The verdict, figures and warnings of one dataset's rewards."""
 
     dataset_id: str
     task: str
     """Kitchen task; of another robot, the id of the dataset that was relabeled."""
     relabel: RelabelRecord
     """How it was relabeled."""
+    verdict: Verdict
     figures: Mapping[str, Estimate]
     """By the keys of `FIGURES`; those that need ground truth or states are missing where there are none."""
     warnings: tuple[str, ...]
@@ -83,10 +85,13 @@ def inspect(dataset_id: str) -> Inspection:
     warnings = reward_warnings(rewards, figures)
     if record.shuffle is not None:
         warnings.insert(0, "These are the scores of other episodes: the dataset was relabeled with --shuffle.")
+    if record.view_cannot_tell:
+        warnings.append(VIEW_CANNOT_TELL)
     return Inspection(
         dataset_id,
         record.source if views is None else views.task,
         record,
+        judge(rewards, figures, shuffled=record.shuffle is not None, view_cannot_tell=record.view_cannot_tell),
         figures,
         tuple(warnings),
         _over_time(rewards, truth),

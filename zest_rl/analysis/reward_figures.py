@@ -14,6 +14,11 @@ from zest_rl.types import FloatArray, GroundTruth
 
 CLOCK, STRAIGHT, SATURATED, STILL, FALLEN, CONTRADICTORY, LENGTH = 0.95, 0.9, 0.95, 0.9, 0.5, 0.01, 0.8
 """Shares from which on a warning is given; `LENGTH`: rank correlation of returns with the episodes' lengths."""
+VIEW_CANNOT_TELL = (
+    "From the first to the last frames this view changes as much as the goal does, but in other directions: one view "
+    "that shows the robot cannot tell; hide the robot (recorded states, or --masks), or add views."
+)
+"""The warning of `zest_rl.rewards.scorer.Scorer.view_cannot_tell`."""
 FLAT = 1e-5
 """Scores whose range is at most this share of the largest count as constant up to rounding."""
 
@@ -23,44 +28,54 @@ class Figure:
     """One number that judges a reward, as `measure_rewards` returns it."""
 
     key: str
+    """In `zest inspect --json`."""
     label: str
-    """Name on pages and in `zest inspect --json`."""
+    """On pages and in text."""
     meaning: str
+    """One sentence."""
 
 
 FIGURES = (
-    Figure("spearman", "Spearman ρ", "rank correlation of the episodes' returns with the true ones; 1 is best"),
-    Figure("kendall", "Kendall τ-b", "the same by pairs; 1 is best"),
-    Figure("pairwise", "Pairwise accuracy", "share of pairs of episodes that are ordered correctly; .5 is chance"),
+    Figure(
+        "spearman",
+        "Rank correlation with the true returns",
+        "Spearman's ρ: 1 orders the episodes as the ground truth does, 0 at random, -1 the wrong way round.",
+    ),
+    Figure("kendall", "Kendall's τ-b with the true returns", "The same, counted by pairs of episodes."),
+    Figure(
+        "pairwise",
+        "Pairs of episodes in the right order",
+        "Share of pairs in which the better episode has the higher return; .5 is chance.",
+    ),
     Figure(
         "auprc",
-        "AUPRC of success",
-        "how well the return separates successes; chance is their share, which is the next line",
+        "Average precision for success",
+        "AUPRC: how well the return separates successes; chance is their share, which is the next line.",
     ),
-    Figure("successes", "Share of successes", "in the dataset"),
+    Figure("successes", "Successful episodes", "Their share in the dataset."),
     Figure(
         "epic",
-        "EPIC distance",
-        "of the score to the true reward, step by step; 0 is equal up to scale and offset, .71 unrelated",
+        "EPIC distance to the true reward",
+        "Compared step by step: 0 is equal up to scale and offset, .71 unrelated.",
     ),
-    Figure("value_order", "Value-order correlation", "of reward and time within an episode; 1 rises at every step"),
+    Figure(
+        "value_order",
+        "Rank correlation with time",
+        "Value-order correlation of score and time in an episode: 1 rises at every step, below 0 it falls.",
+    ),
     Figure(
         "told_by_step",
-        "Told by the step",
-        "share of the rewards' variance that the step number explains; 1 is a clock",
+        "Variance explained by the step number",
+        "1 is a clock: the same score at the same step, whatever the robot does.",
     ),
-    Figure(
-        "straight_in_time",
-        "Straight in time",
-        "R² of a linear trend of the score within an episode; 1 is proportional to time",
-    ),
-    Figure("saturated", "Saturated", "share of rewards close to the lowest or the highest"),
-    Figure("still", "Nothing to see", "share of frames that equal the first one"),
-    Figure("fallen", "Ends lower", "share of episodes whose last frame scores lower than their first"),
+    Figure("straight_in_time", "R² of a linear trend", "Of score over time in an episode; 1 is proportional to time."),
+    Figure("saturated", "Rewards at an end of their range", "Share close to the lowest or the highest."),
+    Figure("still", "Unchanged frames", "Share of frames that equal the first one: nothing is seen to move."),
+    Figure("fallen", "Episodes that end lower", "Share whose last frame scores lower than their first."),
     Figure(
         "contradictory",
-        "Contradictory",
-        "share of frames that score differently from an equal frame of the same episode; 0 is right",
+        "Contradictory scores",
+        "Share of frames that score differently from an equal frame of the same episode; 0 is right.",
     ),
 )
 """In the order of display."""
@@ -89,7 +104,7 @@ def measure_rewards(
     """
     after_actions = [episode[1:] for episode in scores]
     figures = {
-        "value_order": reward_quality.value_order(rewards),
+        "value_order": reward_quality.value_order(after_actions),
         "told_by_step": reward_quality.share_explained_by_step(rewards),
         "straight_in_time": reward_quality.linear_trend_r2(after_actions),
         "saturated": reward_quality.share_saturated(rewards),
@@ -114,6 +129,20 @@ def measure_rewards(
     return figures
 
 
+def all_score_alike(rewards: Sequence[FloatArray]) -> bool:
+    """Whether all rewards are equal up to rounding."""
+    values = np.concatenate(rewards)
+    return bool(np.ptp(values) <= FLAT * np.abs(values).max())
+
+
+def correlation_with_length(rewards: Sequence[FloatArray]) -> float:
+    """Return Spearman's ρ of the returns and the numbers of steps; 0 where all episodes are equally long."""
+    lengths = np.array([len(episode) for episode in rewards])
+    if np.ptp(lengths) == 0:
+        return 0.0
+    return statistics.spearman(reward_quality.returns_of(rewards), lengths, n_resamples=1).value
+
+
 def ends_lower(share: float) -> str:
     """Return the warning of `FALLEN`."""
     return (
@@ -130,14 +159,13 @@ def reward_warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimat
         rewards: (T,) per episode.
         figures: of `measure_rewards`.
     """
-    values = np.concatenate(rewards)
-    if np.ptp(values) <= FLAT * np.abs(values).max():
+    if all_score_alike(rewards):
         return ["All frames score the same: this goal and embedder tell nothing apart. Look at the goal's pictures."]
     sentences = []
     returns, lengths = reward_quality.returns_of(rewards), np.array([len(episode) for episode in rewards])
     if np.ptp(returns) == 0:
         sentences.append("All episodes have the same return: there is nothing to condition a policy on.")
-    by_length = 0.0 if np.ptp(lengths) == 0 else statistics.spearman(returns, lengths, n_resamples=1).value
+    by_length = correlation_with_length(rewards)
     if abs(by_length) >= LENGTH:
         sentences.append(
             f"Episodes are {lengths.min()} to {lengths.max()} steps long, and their returns follow the length (ρ = "

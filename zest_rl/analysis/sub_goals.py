@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from zest_rl.analysis.clips import Clip, embed_clips
 from zest_rl.analysis.episode_view import N_FRAMES, EpisodeView
+from zest_rl.analysis.reward_figures import FLAT
 from zest_rl.data.images import read_image
 from zest_rl.data.video import evenly_spaced, read_frames
 from zest_rl.embedders import DEFAULT_EMBEDDER, Precision, load_embedder
@@ -30,6 +31,9 @@ from zest_rl.rewards.scores import Features, Similarity, score_views
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime.files import user_path
 from zest_rl.types import FloatArray, Frame
+
+SMOOTH, MIN_FRAMES = 0.5, 10
+"""Correlation of a score and the next one above which a curve is no noise; of fewer frames, that cannot be told."""
 
 
 @dataclass(frozen=True)
@@ -52,16 +56,39 @@ class SubGoalScores:
         return int(np.argmax(self.scores))
 
     @property
+    def has_signal(self) -> bool:
+        """Whether the scores after the first are more than one value or noise.
+
+        Of noise, a score tells nothing of the next one.
+        """
+        centred = self.scores[1:].astype(np.float64)
+        centred -= centred.mean()
+        if np.abs(centred).max() <= FLAT * np.abs(self.scores).max():
+            return False
+        correlation = (centred[1:] * centred[:-1]).sum() / (centred**2).sum()
+        return len(centred) < MIN_FRAMES or bool(correlation > SMOOTH)
+
+    @property
     def rises_at(self) -> int | None:
-        """First step at which the score is half-way from its first to its highest value; None if it never rises."""
+        """First step at which the score is half-way from its first to its highest value.
+
+        None if it never rises, or there is no signal.
+        """
         half = (self.scores[0] + self.scores.max()) / 2
-        return int(np.argmax(self.scores >= half)) if self.highest_at > 0 else None
+        return int(np.argmax(self.scores >= half)) if self.has_signal and self.highest_at > 0 else None
+
+    @property
+    def rises(self) -> str:
+        """When it rises, in words."""
+        if not self.has_signal:
+            return "no signal"
+        return "never rises" if self.rises_at is None else f"rises at step {self.rises_at}"
 
     def as_json(self) -> dict[str, Any]:
-        """Return the steps of rise, maximum and success, and the scores to four decimals."""
+        """Return whether it has a signal, the steps of rise, maximum and success, and the scores to four decimals."""
         scores = [round(float(score), 4) for score in self.scores]
         steps = {"rises_at": self.rises_at, "highest_at": self.highest_at, "done_at": self.done_at}
-        return {**steps, "scores": scores}
+        return {"signal": self.has_signal, **steps, "scores": scores}
 
 
 def rise_in_order(sub_goals: Sequence[SubGoalScores]) -> bool:

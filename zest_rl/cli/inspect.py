@@ -14,8 +14,8 @@ from zest_rl.cli.ui import Ui, progress_in_parts
 
 @dataclass(frozen=True)
 class Config:
-    """Judge the rewards of relabeled datasets: rankings against the ground truth where there is one, and what can be
-    said without it. With datasets of several tasks, also which task each goal scores highest.
+    """Judge the rewards of relabeled datasets: a verdict first, then rankings against the ground truth where there is
+    one, and what can be said without it. With datasets of several tasks, also which task each goal scores highest.
     """
 
     datasets: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="DATASET [DATASET …]")] = ()
@@ -29,7 +29,7 @@ class Config:
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
-    """Measure, warn, write the page."""
+    """Measure, judge, write the page."""
     from zest_rl.analysis.cross_task import inspect_datasets
     from zest_rl.report.html import write_report
     from zest_rl.report.inspection_page import inspection_report
@@ -40,24 +40,27 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         )
     for sentence in inspected.left_out:
         ui.warn(sentence)
-    for dataset, sentences in inspected.warnings.items():
-        for sentence in sentences:
-            ui.warn(f"{dataset}: {sentence}")
     page = write_report(inspection_report(inspected), config.output)
     return {**inspected.to_json(), "report": str(page), "next": f"open {page} in a browser"}
 
 
 def summary(result: Mapping[str, Any]) -> str:
-    """The figures as text, one block per dataset."""
-    lines = []
+    """The verdicts, then warnings and figures as text, one block per dataset."""
+    from zest_rl.analysis.reward_figures import FIGURES
+    from zest_rl.analysis.verdict import Verdict
+
+    verdicts = {dataset: Verdict.from_json(verdict) for dataset, verdict in result["verdicts"].items()}
+    lines = [f"{dataset}: {verdict}" for dataset, verdict in verdicts.items()]
     for dataset, judged in result["datasets"].items():
-        lines.append(f"{dataset}: {judged['label']}")
-        for name, figure in judged["figures"].items():
-            value = (
-                "undefined"
-                if figure is None
-                else f"{figure['value']:.3f}  [{figure['ci95'][0]:.3f}, {figure['ci95'][1]:.3f}]"
-            )
-            lines.append(f"  {name:<26}{value}")
-    n_warnings = sum(map(len, result["warnings"].values()))
-    return "\n".join([*lines, f"{n_warnings} warnings", f"report: {result['report']}"])
+        lines += ["", f"{dataset}: {judged['label']}"]
+        lines += [f"  warning: {sentence}" for sentence in result["warnings"][dataset]]
+        figures = judged["figures"]
+        lines += [f"{_cell(figures[f.key])}  {f.label}. {f.meaning}" for f in FIGURES if f.key in figures]
+    return "\n".join([*lines, "", f"report: {result['report']}"])
+
+
+def _cell(figure: Mapping[str, Any] | None) -> str:
+    if figure is None:
+        return f"  {'undefined':<23}"
+    low, high = figure["ci95"]
+    return f"  {figure['value']:6.3f} {f'[{low:.3f}, {high:.3f}]':<16}"

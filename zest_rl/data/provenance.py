@@ -95,6 +95,8 @@ class RelabelRecord:
     frames: Mapping[str, Any] | None = None
     """Origin of frames that were not rendered from kitchen states (`sources.base.EpisodeFrames.describe`)."""
     frames_sha256: str | None = None
+    view_cannot_tell: bool = False
+    """See `zest_rl.rewards.scorer.Scorer.view_cannot_tell`; only of one view in which the robot is not hidden."""
     provenance: Mapping[str, Any] | None = None
     """Command, versions and machine; left out of a run's ``meta.json``."""
 
@@ -119,6 +121,7 @@ class RelabelRecord:
     def to_json(self) -> dict[str, Any]:
         """The record as a dataset's metadata hold it."""
         frames = {} if self.frames is None else {"frames": dict(self.frames), "frames_sha256": self.frames_sha256}
+        of_view = {"view_cannot_tell": True} if self.view_cannot_tell else {}
         provenance = {} if self.provenance is None else {"provenance": dict(self.provenance)}
         return {
             "source": self.source,
@@ -129,6 +132,7 @@ class RelabelRecord:
             "kept_goals": None if self.kept_goals is None else list(self.kept_goals),
             "scorer": self.scorer.to_json(),
             "n_still_frames": self.n_still_frames,
+            **of_view,
             **provenance,
         }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 
 import numpy as np
@@ -24,6 +25,7 @@ from zest_rl.report.sections import (
     REWARD_QUALITY,
     SCORES_OVER_TIME,
     TASKS_AGAINST_GOALS,
+    VERDICT,
     VIEWS,
     WARNINGS,
     Report,
@@ -40,11 +42,12 @@ def inspection_report(joint: JointInspection) -> Report:
     }
     ends = joint.confusion
     matrices = [] if ends is None else [ScoreMatrix(ends.row_names(), names, ends.means, ends.low, ends.high)]
-    n_warnings = sum(map(len, joint.warnings.values()))
+    advice = Counter(each.verdict.advice for each in joint.inspections)
     return Report(
         "What these rewards are worth",
-        f"Datasets: {len(names)}, warnings: {n_warnings}. Nothing was trained.",
+        f"Datasets: {len(names)}. {', '.join(f'{text.capitalize()}: {n}' for text, n in advice.items())}.",
         (
+            VERDICT((name, each.verdict) for name, each in inspections.items()),
             WARNINGS(f"{dataset}: {text}" for dataset, texts in joint.warnings.items() for text in texts),
             REWARD_QUALITY([_quality(inspections)]),
             TASKS_AGAINST_GOALS(matrices),

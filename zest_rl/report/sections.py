@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
+from zest_rl.analysis.verdict import Verdict
 from zest_rl.report.content import (
     Curve,
     EpisodePanel,
@@ -81,6 +82,8 @@ TASK_TABLES = SectionKind[TaskTable](
     "Each task on its own; its page has the goals, the episodes' videos and all settings.",
 )
 CAVEATS = SectionKind[str]("Caveats", "sentences.html")
+VERDICT = SectionKind[tuple[str, Verdict]]("Verdict", "verdicts.html")
+"""A dataset and what to do with it."""
 WARNINGS = SectionKind[str]("Warnings", "sentences.html", "What speaks against training on these rewards.")
 REWARD_QUALITY = SectionKind[QualityTable](
     "Reward quality",

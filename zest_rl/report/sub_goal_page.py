@@ -14,10 +14,14 @@ from zest_rl.report.sections import DETAILS, FRAMES, SUB_GOALS, Report
 def sub_goal_report(sub_goals: Sequence[SubGoalScores], details: dict[str, object]) -> Report:
     """Build the page of one episode."""
     steps = np.arange(len(sub_goals[0].scores), dtype=np.float32)
-    order = "rise one after another, in the order of" if rise_in_order(sub_goals) else "do not rise in the order of"
+    if not any(sub_goal.has_signal for sub_goal in sub_goals):
+        order = "There is no signal, as no score tells anything of the next"
+    elif rise_in_order(sub_goals):
+        order = "The scores rise one after another, in the order of the sub-goals"
+    else:
+        order = "The scores do not rise in the order of the sub-goals"
     rises = [
-        f"{sub_goal.name} {'never' if sub_goal.rises_at is None else f'at step {sub_goal.rises_at}'}"
-        + ("" if sub_goal.done_at is None else f" (done at {sub_goal.done_at})")
+        f"{sub_goal.name} {sub_goal.rises}" + ("" if sub_goal.done_at is None else f" (done at {sub_goal.done_at})")
         for sub_goal in sub_goals
     ]
     strips = (
@@ -32,6 +36,6 @@ def sub_goal_report(sub_goals: Sequence[SubGoalScores], details: dict[str, objec
     curves = (Curve(sub_goal.name, "similarity to the sub-goal", steps, sub_goal.scores) for sub_goal in sub_goals)
     return Report(
         "Similarity to each sub-goal",
-        f"The scores {order} the sub-goals: {', '.join(rises)}.",
+        f"{order}: {', '.join(rises)}.",
         (FRAMES(strips), SUB_GOALS(curves), DETAILS(details.items())),
     )

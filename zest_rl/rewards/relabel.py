@@ -56,7 +56,7 @@ class Relabeled:
     """``distinct_states`` or ``episodes``."""
     n_still: int | None
     """Number of unchanged frames, equal to the first of their episode; None if the dataset existed."""
-    view_cannot_tell: bool = False
+    view_cannot_tell: bool
     """See `zest_rl.rewards.scorer.Scorer.view_cannot_tell`; only of one view in which the robot is not hidden."""
 
     @property
@@ -184,7 +184,7 @@ def relabel_source(
     target_id = relabeled_id(trajectories.dataset_id, digest)
     path = reader.dataset_path(target_id)
 
-    def result(scorer: Scorer, n_still: int | None, *, view_cannot_tell: bool = False) -> Relabeled:
+    def result(scorer: Scorer, n_still: int | None, *, view_cannot_tell: bool) -> Relabeled:
         n_frames = sum(trajectories.n_steps) + len(trajectories.n_steps)
         n_embedded = embeddings.n_embedded
         unit = embeddings.unit
@@ -195,7 +195,8 @@ def relabel_source(
         with reader.open_dataset(target_id) as ds:
             record = ds.record.relabel
         kept = None if record is None else record.kept_goals
-        return result(scorer if kept is None else scorer.with_goals(np.array(kept)), None)
+        found = scorer if kept is None else scorer.with_goals(np.array(kept))
+        return result(found, None, view_cannot_tell=record is not None and record.view_cannot_tell)
 
     if reader.exists(target_id):
         return existing()
@@ -209,6 +210,10 @@ def relabel_source(
         scores, n_still = scorer.score_episodes(embeddings)
         if shuffle is not None:
             scores = shuffled(scores, shuffle)
+        of_pictures = scorer.goal is not None and not scorer.goal.is_text
+        is_masked = isinstance(source.frames, KitchenStates | SceneStates | MaskedFrames)
+        one_camera = len(source.frames.views) == 1 and not is_masked and of_pictures
+        view_cannot_tell = one_camera and scorer.view_cannot_tell(embeddings)
         record = RelabelRecord(
             source=trajectories.dataset_id,
             source_sha256=source_sha256,
@@ -218,6 +223,7 @@ def relabel_source(
             kept_goals=None if kept is None else tuple(kept.tolist()),
             scorer=scorer.record,
             n_still_frames=n_still,
+            view_cannot_tell=view_cannot_tell,
             provenance=artifacts.provenance(),
         )
 
@@ -235,10 +241,6 @@ def relabel_source(
             zest={"relabel": record.to_json()},
             extra=add,
         )
-        of_pictures = scorer.goal is not None and not scorer.goal.is_text
-        is_masked = isinstance(source.frames, KitchenStates | SceneStates | MaskedFrames)
-        one_camera = len(source.frames.views) == 1 and not is_masked and of_pictures
-        view_cannot_tell = one_camera and scorer.view_cannot_tell(embeddings)
     return result(scorer, n_still, view_cannot_tell=view_cannot_tell)
 
 

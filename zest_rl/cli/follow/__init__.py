@@ -49,15 +49,17 @@ def summary(result: Mapping[str, Any]) -> str:
     """One line per sub-goal, as text."""
     lines = [
         f"  {name:<16} "
-        + ("never rises" if times["rises_at"] is None else f"rises at step {times['rises_at']:>3}")
+        + _rise(times)
         + f", highest at {times['highest_at']:>3}"
         + ("" if times["done_at"] is None else f", done at {times['done_at']:>3}")
         for name, times in result["sub_goals"].items()
     ]
-    return "\n".join(
-        [
-            *lines,
-            f"in the order of the sub-goals: {'yes' if result['in_order'] else 'no'}",
-            f"report: {result['report']}",
-        ]
-    )
+    has_signal = any(times["signal"] for times in result["sub_goals"].values())
+    order = ("yes" if result["in_order"] else "no") if has_signal else "no signal"
+    return "\n".join([*lines, f"in the order of the sub-goals: {order}", f"report: {result['report']}"])
+
+
+def _rise(times: Mapping[str, Any]) -> str:
+    if not times["signal"]:
+        return "no signal"
+    return "never rises" if times["rises_at"] is None else f"rises at step {times['rises_at']:>3}"

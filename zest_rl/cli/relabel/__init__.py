@@ -19,7 +19,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
     import numpy as np
 
-    from zest_rl.analysis.reward_figures import FALLEN, ends_lower
+    from zest_rl.analysis.reward_figures import FALLEN, VIEW_CANNOT_TELL, ends_lower
     from zest_rl.data.reader import open_dataset
     from zest_rl.rewards.preview import preview
     from zest_rl.rewards.relabel import relabel
@@ -51,10 +51,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     if fallen >= FALLEN:
         ui.warn(f"{ends_lower(fallen)} `zest inspect` says more")
     if relabeled.view_cannot_tell:
-        ui.warn(
-            "from the first to the last frames this view changes as much as the goal does, but in other directions: "
-            "one view that shows the robot cannot tell; hide the robot (recorded states, or --masks), or add views"
-        )
+        ui.warn(VIEW_CANNOT_TELL)
     return {
         "dataset": relabeled.dataset_id,
         "path": str(relabeled.path),
