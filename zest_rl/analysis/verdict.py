@@ -1,4 +1,4 @@
-"""Is a reward worth training on? One line, and the two figures that decide; docs/stages.md explains the rules."""
+"""Is a reward worth training on? One line, and the two figures that decide; docs/inspect.md explains the rules."""
 
 from __future__ import annotations
 
