@@ -54,6 +54,7 @@ def test_the_snippets_of_the_python_page_run(monkeypatch: pytest.MonkeyPatch) ->
     assert names["rewards"].shape == (len(curve) - 1,)
     assert (len(names["episodes"]), len(result.episodes)) == (4, 1)
     assert result.episodes[0].zest_return is not None, "the return-to-go falls by online scores"
+    assert max(len(repr(each)) for each in (result, names["ds"])) < 1200, "what a notebook prints of them is short"
     assert names["actions"].shape == (1, names["episodes"][0].actions.shape[1])
     assert names["vectors"].shape == (2, 1280)
     assert all(map(Path.is_file, map(Path, ("scores.csv", "report.html", "transitions.npz"))))

@@ -9,7 +9,7 @@ import functools
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, astuple, dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
@@ -98,8 +98,8 @@ class Evaluation:
     minimum: float | None
     expert: float | None
     """Ground-truth returns that count as 0 % and 100 %; None where the dataset has no such references."""
-    episodes: tuple[EpisodeResult, ...]
-    traces: Traces
+    episodes: tuple[EpisodeResult, ...] = field(repr=False)
+    traces: Traces = field(repr=False)
     """What `run_episodes` returns, and of a foreign policy clipped (N,), the number of actions that left [-1, 1]."""
     environment: RunEnvironment
 

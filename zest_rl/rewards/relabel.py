@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -46,8 +46,8 @@ class Relabeled:
 
     dataset_id: str
     path: Path
-    source: Source
-    scorer: Scorer
+    source: Source = field(repr=False)
+    scorer: Scorer = field(repr=False)
     n_frames: int
     """Scored frames of one view: T + 1 per episode."""
     n_embedded: int
