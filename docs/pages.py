@@ -86,8 +86,8 @@ def _cell(cell: Mapping[str, Any]) -> Iterator[str]:
 
 
 def verbs() -> Iterator[str]:
-    """Write the help of every verb, as ``zest VERB --help`` prints it 100 columns wide."""
-    os.environ["COLUMNS"] = "100"
+    """Write the help of every verb, as ``zest VERB --help`` prints it 88 columns wide."""
+    os.environ["COLUMNS"] = "88"
     from zest_rl.cli.verbs import VERBS
 
     for verb, summary in VERBS.items():
