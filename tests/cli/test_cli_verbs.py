@@ -148,8 +148,8 @@ def test_what_cannot_be_done_has_an_exit_code_and_says_what_to_do(
     trained: Path, refusal: Callable[..., tuple[int, str]], tmp_path: Path
 ) -> None:
     for words, code, complaint in (
-        (("train", "bc", "zest/kitchen-micro-tini-v0"), 2, "did you mean 'zest/kitchen-micro-tiny-v0'"),
-        (("train", "bc", COLLECTED, "--run-dir", trained / "bc-0"), 2, "holds a run with other arguments"),
+        (("train", "bc", "zest/kitchen-micro-tini-v0"), 2, "`minari download zest/kitchen-micro-tini-v0`"),
+        (("train", "bc", COLLECTED, "--run-dir", trained / "bc-0"), 2, "of that run, or give another --run-dir"),
         (("train", "bc", COLLECTED, "--top-fraction", "2", "--run-dir", tmp_path / "x"), 2, "top_fraction must be in"),
         (("evaluate", tmp_path / "nothing"), 2, "is not the folder of a training"),
         (("evaluate", trained / "gt-0", "--score"), 2, "was not trained on a relabeled dataset"),

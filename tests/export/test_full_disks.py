@@ -35,7 +35,7 @@ def test_a_disk_that_fills_up_while_exporting_is_an_error_of_this_process_and_le
     disk.fill(4096)
     with pytest.raises(ZestError, match=EXPORT_FAILED):
         export(scored, to, disk.path / "out")
-    assert {path.name for path in disk.path.iterdir()} == {"ballast", ".out.lock"}
+    assert {path.name for path in disk.path.iterdir()} == {"ballast"}
 
 
 @pytest.mark.slow
@@ -60,7 +60,7 @@ def test_whatever_room_is_left_an_hdf5_file_is_whole_or_not_there(
 def test_an_export_for_which_there_is_no_room_is_refused_beforehand(scored: str, disk: Disk) -> None:
     with pytest.raises(ZestError, match="not enough disk space"):
         export(scored, "d4rl", disk.path / "out")
-    assert {path.name for path in disk.path.iterdir()} == {".out.lock"}
+    assert {path.name for path in disk.path.iterdir()} == set()
 
 
 def exporting(dataset_id: str, to: str, path: Path) -> subprocess.Popen[str]:
@@ -77,4 +77,4 @@ def test_of_two_exports_to_one_place_the_second_is_refused_and_harms_nothing(
     messages = [process.communicate(timeout=120)[1] for process in both]
     assert sorted(process.returncode for process in both) == [0, 2]
     assert sum("exists; delete it, or choose another --output" in message for message in messages) == 1
-    assert {path.name for path in tmp_path.glob("*out*")} == {"out", ".out.lock"}
+    assert {path.name for path in tmp_path.glob("*out*")} == {"out"}

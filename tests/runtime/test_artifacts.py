@@ -190,7 +190,7 @@ def test_files_and_folders_have_the_permissions_that_the_umask_leaves(
     finally:
         os.umask(before)
     modes = {name: (tmp_path / name).stat().st_mode & 0o777 for name in names(tmp_path)}
-    assert modes == {"deep": folder, "deep/a.json": file, "run": folder, "run/sub": folder, ".run.lock": file}
+    assert modes == {"deep": folder, "deep/a.json": file, "run": folder, "run/sub": folder}
 
 
 def test_json_survives_the_way_to_disk_and_back(tmp_path: Path) -> None:
@@ -331,6 +331,32 @@ def test_a_file_system_without_locks_is_called_that(tmp_path: Path) -> None:
 def test_locks_of_different_artifacts_do_not_meet(tmp_path: Path) -> None:
     with artifacts.lock(tmp_path / "a"), artifacts.lock(tmp_path / "b"):
         assert names(tmp_path) == {".a.lock", ".b.lock"}
+    assert names(tmp_path) == set()
+
+
+def test_of_nested_locks_the_outermost_deletes_the_file(tmp_path: Path) -> None:
+    with artifacts.lock(tmp_path / "a"):
+        with artifacts.lock(tmp_path / "a"):
+            pass
+        assert names(tmp_path) == {".a.lock"}
+    assert names(tmp_path) == set()
+
+
+COUNT = """
+print("ready", flush=True)
+for _ in range(200):
+    with artifacts.lock(Path(sys.argv[1])):
+        n = int(Path(sys.argv[1]).read_text())
+        Path(sys.argv[1]).write_text(str(n + 1))"""
+
+
+def test_processes_that_take_turns_never_hold_a_lock_at_once_though_each_deletes_its_file(tmp_path: Path) -> None:
+    target = tmp_path / "count"
+    target.write_text("0")
+    processes = [start(COUNT, target) for _ in range(3)]
+    assert [process.communicate()[1] for process in processes] == [""] * 3
+    assert target.read_text() == "600"
+    assert names(tmp_path) == {"count"}
 
 
 # --- places that cannot be written to ---------------------------------------------------------------------------------

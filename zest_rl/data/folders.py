@@ -78,7 +78,8 @@ def verified_metadata(dataset_id: str) -> dict[str, Any]:
     if not exists(dataset_id):
         raise BadInput(
             f"there is no dataset {dataset_id!r} under the Minari root; {nearest(dataset_id, list_datasets())}. "
-            "Make one with `zest collect`, or set MINARI_DATASETS_PATH to the folder that holds it"
+            f"Make one with `zest collect`, fetch a public one with `minari download {dataset_id}`, or set "
+            "MINARI_DATASETS_PATH to the folder that holds it"
         )
     files = _files(folder)
     for name in (DATA_FILE, METADATA_FILE, MANIFEST_FILE):

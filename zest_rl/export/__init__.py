@@ -46,7 +46,8 @@ Format = Literal["npz", "d4rl", "robomimic", "d3rlpy", "torchrl", "lerobot", "le
 class _Writer:
     """One format."""
 
-    write: Callable[[Path, TransitionDataset], None]
+    write: Callable[[Path, TransitionDataset], list[str]]
+    """Writes, and returns the names of the arrays as a reader of the format types them, I for an episode's number."""
     suffix: str
     """Of the file or folder."""
     is_folder: bool = False
@@ -74,7 +75,7 @@ class Exported:
     n_episodes: int
     n_transitions: int
     arrays: tuple[str, ...]
-    """Names of the arrays of `transitions` in it."""
+    """Their names in it; in those of single episodes, I stands for the number."""
     n_bytes: int
     left_out: tuple[str, ...]
     """Entries of the observations that are not numbers: pictures and text."""
@@ -135,8 +136,5 @@ def _write(path: Path, dataset_id: str, to: Format, shape: Shape, normalise: boo
         )
     size = sum(array.nbytes for episode in data.episodes for array in episode.values())
     artifacts.check_free_space(path.parent, 2 * size)
-    if to == "lerobot":
-        lerobot.write(path, data, fps)
-    else:
-        writer.write(path, data)
-    return Exported(path, len(data.episodes), len(data), tuple(data.episodes[0]), 0, data.left_out)
+    names = lerobot.write(path, data, fps) if to == "lerobot" else writer.write(path, data)
+    return Exported(path, len(data.episodes), len(data), tuple(names), 0, data.left_out)

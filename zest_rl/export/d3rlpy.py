@@ -44,12 +44,13 @@ def fields(episode: Transitions) -> dict[str, object]:
     }
 
 
-def write(path: Path, data: TransitionDataset) -> None:
+def write(path: Path, data: TransitionDataset) -> list[str]:
     """Write `NAME_I` of every episode; d3rlpy ignores names that are not in ``columns``, such as ``zest_score_I``."""
     arrays = {"columns": list(fields(data.episodes[0])), "num_episodes": len(data.episodes), "version": VERSION}
     for i, episode in enumerate(data.episodes):
         arrays |= {f"{name}_{i}": values for name, values in {**episode, **fields(episode)}.items()}
     write_hdf5(path, arrays, {"/": {"about": json.dumps(data.about)}})
+    return [f"{name}_I" for name in {**data.episodes[0], **fields(data.episodes[0])}]
 
 
 def to_d3rlpy(dataset_id: str, *, shape: Shape = "step", normalise: bool = False) -> d3rlpy.dataset.ReplayBuffer:

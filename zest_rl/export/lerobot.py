@@ -41,7 +41,7 @@ Columns = dict[str, NDArray[Any]]
 """Equally long arrays (T,) or (T, dim) by LeRobot's names."""
 
 
-def write(folder: Path, data: TransitionDataset, fps: int | None = None) -> None:
+def write(folder: Path, data: TransitionDataset, fps: int | None = None) -> list[str]:
     """Write a dataset, with the side-car if there are scores; `fps` as in `zest_rl.export.export`.
 
     Raises:
@@ -87,9 +87,10 @@ def write(folder: Path, data: TransitionDataset, fps: int | None = None) -> None
         },
     }
     artifacts.write_json(folder / "meta/info.json", info)
+    return list(columns)
 
 
-def write_progress(path: Path, data: TransitionDataset) -> None:
+def write_progress(path: Path, data: TransitionDataset) -> list[str]:
     """Write only the side-car: index, episode_index, frame_index, progress_sparse, and the unscaled zest_score.
 
     Raises:
@@ -99,18 +100,15 @@ def write_progress(path: Path, data: TransitionDataset) -> None:
     scores = np.concatenate([score[:-1] for score in data.scores])
     low, size = scores.min(), np.ptp(scores)
     lengths = [len(score) - 1 for score in data.scores]
-    _write_parquet(
-        path,
-        _table(
-            {
-                "index": np.arange(len(scores)),
-                "episode_index": np.repeat(np.arange(len(lengths)), lengths),
-                "frame_index": np.concatenate([np.arange(length) for length in lengths]),
-                "progress_sparse": ((scores - low) / (size or 1)).astype(np.float32),
-                "zest_score": scores,
-            }
-        ),
-    )
+    columns = {
+        "index": np.arange(len(scores)),
+        "episode_index": np.repeat(np.arange(len(lengths)), lengths),
+        "frame_index": np.concatenate([np.arange(length) for length in lengths]),
+        "progress_sparse": ((scores - low) / (size or 1)).astype(np.float32),
+        "zest_score": scores,
+    }
+    _write_parquet(path, _table(columns))
+    return list(columns)
 
 
 def _columns(flat: Transitions, starts: NDArray[Any], fps: int) -> Columns:

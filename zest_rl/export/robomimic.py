@@ -15,7 +15,7 @@ VALID_SHARE = 0.1
 """Of the episodes, for the mask ``valid``."""
 
 
-def write(path: Path, data: TransitionDataset) -> None:
+def write(path: Path, data: TransitionDataset) -> list[str]:
     """Write ``data/demo_I`` with ``obs/flat`` and ``next_obs/flat``; ``dones`` includes timeouts.
 
     A single episode is in the mask ``train``, and ``valid`` is empty, which robomimic's SequenceDataset accepts.
@@ -42,3 +42,4 @@ def write(path: Path, data: TransitionDataset) -> None:
     for mask, members in (("valid", valid), ("train", set(range(len(names))) - valid)):
         arrays[f"mask/{mask}"] = np.array([names[i].encode() for i in sorted(members)], dtype="S")
     write_hdf5(path, arrays, attributes)
+    return [name.replace("demo_0", "demo_I") for name in arrays if name.startswith("data/demo_0/")]

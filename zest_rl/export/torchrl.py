@@ -47,13 +47,14 @@ def nested(data: TransitionDataset) -> tuple[dict[str, NDArray[Any]], dict[str, 
     return root, {name: values if values.ndim == 2 else values[:, None] for name, values in after.items()}
 
 
-def write(folder: Path, data: TransitionDataset) -> None:
+def write(folder: Path, data: TransitionDataset) -> list[str]:
     """Write one raw little-endian ``KEY.memmap`` per array and ``meta.json``; ``about.json`` beside them."""
     root, after = nested(data)
     (folder / "next").mkdir()
     _write_level(folder, root, {"next": {"type": "TensorDict"}})
     _write_level(folder / "next", after, {})
     artifacts.write_json(folder / "about.json", data.about)
+    return [*root, *(f"next/{name}" for name in after)]
 
 
 def _write_level(folder: Path, arrays: dict[str, NDArray[Any]], children: dict[str, Any]) -> None:

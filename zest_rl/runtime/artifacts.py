@@ -22,7 +22,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -253,6 +253,8 @@ def staged_folder(final: Path) -> Iterator[Path]:
 def lock(target: Path) -> Iterator[None]:
     """Hold the lock of an artifact; a second process says that it waits (a killed one frees its lock). May be nested.
 
+    The file is deleted at the end; filelock takes a new one where the one that it waited for is gone.
+
     Raises:
         ZestError: the folder cannot be written to, or its file system has no locks.
     """
@@ -272,6 +274,9 @@ def lock(target: Path) -> Iterator[None]:
     try:
         yield
     finally:
+        if held.lock_counter == 1:  # the outermost of nested ones
+            with suppress(OSError):
+                path.unlink()
         held.release()
 
 

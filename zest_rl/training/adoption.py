@@ -96,10 +96,10 @@ def adopt(
             before = artifacts.read_json(run_dir / "meta.json")
             differing = sorted(key for key, value in request.items() if before.get(key) != value)
             if differing:
-                raise BadInput(f"{run_dir} holds another run ({', '.join(differing)} differ); choose another folder")
+                raise BadInput(f"{run_dir} holds another run ({', '.join(differing)} differ); give another --run-dir")
             return run_dir
         if run_dir.exists() and any(run_dir.iterdir()):
-            raise BadInput(f"{run_dir} is not empty and holds no policy; choose another folder")
+            raise BadInput(f"{run_dir} is not empty and holds no policy; give another --run-dir")
         with artifacts.staged_folder(run_dir) as staging:
             for place, original in identity.originals.items():
                 (staging / place).parent.mkdir(exist_ok=True)

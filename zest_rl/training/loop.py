@@ -310,10 +310,10 @@ def _check_request(run_dir: Path, request: dict[str, Any]) -> None:
         if differing:
             raise BadInput(
                 f"{run_dir} holds a run with other arguments: {'; '.join(differing)}; repeat the arguments of that "
-                "run, or choose another folder"
+                "run, or give another --run-dir"
             )
     elif run_dir.exists() and any(not entry.name.startswith(".") for entry in run_dir.iterdir()):
-        raise BadInput(f"{run_dir} is not empty and holds no run; choose another folder")
+        raise BadInput(f"{run_dir} is not empty and holds no run; give another --run-dir")
     else:
         artifacts.write_json(path, request)
 
