@@ -265,6 +265,24 @@ def test_the_summary_lists_the_result_and_ends_with_the_next_command(
     ]  # fmt: skip
 
 
+def test_figures_are_listed_with_one_unit_each(
+    toy: Callable[..., ModuleType], capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = {
+        "normalized_return": {"value": 36.57, "low": 30.1, "high": 42.0}, "iqm": 35.0, "clipped_actions": 0.012,
+        "success": {"value": 0.0, "low": 0.0, "high": 0.161}, "n_episodes": 20,
+    }  # fmt: skip
+    toy(lambda config, ui: result)
+    assert cli.main(["toy", "d"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "normalized_return: 36.6 % of the expert, 95 % interval 30.1 to 42.0 %", "iqm: 35.0 %",
+        "clipped_actions: 1.2 %", "success: 0 of 20, 95 % interval 0 to 16 %", "n_episodes: 20",
+    ]  # fmt: skip
+    toy(lambda config, ui: {"return": {"value": -12.345, "low": -14.0, "high": -1.0}, "iqm": -12.0})
+    assert cli.main(["toy", "d"]) == 0
+    assert capsys.readouterr().out.splitlines() == ["return: -12.35, 95 % interval -14 to -1", "iqm: -12"]
+
+
 def test_a_verb_may_write_its_own_summary(toy: Callable[..., ModuleType], capsys: pytest.CaptureFixture[str]) -> None:
     toy(lambda config, ui: {"n": 3}, summary=lambda result: f"{result['n']} toys")
     assert cli.main(["toy", "d"]) == 0

@@ -96,10 +96,8 @@ def arrays_of(dataset_id: str) -> dict[str, tuple[str, tuple[int, ...], bytes]]:
 
 
 def left_behind(root: Path) -> set[str]:
-    """What is in a folder beside locks, which are empty and stay, and the tests' ballast."""
-    return {p.relative_to(root).as_posix() for p in root.rglob("*") if p.is_file() and p.name != "ballast"} - {
-        p.relative_to(root).as_posix() for p in root.rglob(".*.lock")
-    }
+    """What is in a folder beside the tests' ballast."""
+    return {p.relative_to(root).as_posix() for p in root.rglob("*") if p.is_file() and p.name != "ballast"}
 
 
 def listed() -> set[str]:

@@ -57,7 +57,8 @@ def test_transitions_are_the_dataset_s_unshifted(scored: str) -> None:
 
 @pytest.mark.parametrize("to", ["npz", "d4rl"])
 def test_flat_files_hold_all_transitions_and_say_where_they_come_from(scored: str, to: str, tmp_path: Path) -> None:
-    path = export(scored, to, tmp_path / "data.out").path  # type: ignore[arg-type]
+    exported = export(scored, to, tmp_path / "data.out")  # type: ignore[arg-type]
+    path = exported.path
     if to == "npz":
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
@@ -66,7 +67,7 @@ def test_flat_files_hold_all_transitions_and_say_where_they_come_from(scored: st
         with h5py.File(path) as file:
             arrays, about = {name: values[()] for name, values in file.items()}, json.loads(file.attrs["about"])
     episodes = transitions(scored)
-    assert set(arrays) == {*episodes[0], "episode"}
+    assert set(arrays) == {*episodes[0], "episode"} == set(exported.arrays)
     for i, episode in enumerate(episodes):
         for name, values in episode.items():
             np.testing.assert_array_equal(arrays[name][arrays["episode"] == i], values)
@@ -80,9 +81,11 @@ def test_flat_files_hold_all_transitions_and_say_where_they_come_from(scored: st
 
 
 def test_robomimic_files_hold_one_group_per_episode(scored: str, tmp_path: Path) -> None:
-    path = export(scored, "robomimic", tmp_path / "data.hdf5").path
+    exported = export(scored, "robomimic", tmp_path / "data.hdf5")
     episodes = transitions(scored)
-    with h5py.File(path) as file:
+    with h5py.File(exported.path) as file:
+        assert all(name.replace("demo_I", "demo_3") in file for name in exported.arrays)
+        assert "data/demo_I/obs/flat" in exported.arrays
         assert file["data"].attrs["total"] == sum(len(episode["rewards"]) for episode in episodes)
         env = json.loads(file["data"].attrs["env_args"])
         assert (env["env_name"], env["env_kwargs"]["task"]) == ("zest/Kitchen-v1", "micro")
@@ -103,8 +106,9 @@ def test_robomimic_files_hold_one_group_per_episode(scored: str, tmp_path: Path)
 
 
 def test_d3rlpy_files_hold_what_its_loader_asks_for(scored: str, tmp_path: Path) -> None:
-    path = export(scored, "d3rlpy", tmp_path / "data.h5").path
-    with h5py.File(path) as file:
+    exported = export(scored, "d3rlpy", tmp_path / "data.h5")
+    with h5py.File(exported.path) as file:
+        assert {name.replace("_I", "_3") for name in exported.arrays} == {name for name in file if name.endswith("_3")}
         assert file["columns"][()].tolist() == [b"observations", b"actions", b"rewards", b"terminated"]
         assert (file["num_episodes"][()], file["version"][()]) == (4, b"2.1")
         for i, episode in enumerate(transitions(scored)):
@@ -119,6 +123,9 @@ def test_torchrl_folders_hold_a_raw_file_per_entry(scored: str, tmp_path: Path) 
     episodes = transitions(scored)
     root, after = (json.loads((written.path / name).read_text()) for name in ("meta.json", "next/meta.json"))
     assert root["shape"] == after["shape"] == [400]
+    assert {f"{name}.memmap" for name in written.arrays} == {
+        path.relative_to(written.path).as_posix() for path in written.path.rglob("*.memmap")
+    }
     assert root["next"] == {"type": "TensorDict"}
     assert after["reward"] == {"device": "cpu", "shape": [400, 1], "dtype": "torch.float32", "is_nested": False}
     reward = np.fromfile(written.path / "next/reward.memmap", np.float32)
@@ -130,7 +137,8 @@ def test_torchrl_folders_hold_a_raw_file_per_entry(scored: str, tmp_path: Path) 
 
 
 def test_lerobot_folders_hold_a_row_per_frame_and_progress_beside_them(scored: str, tmp_path: Path) -> None:
-    folder = export(scored, "lerobot", tmp_path / "data", fps=10).path
+    exported = export(scored, "lerobot", tmp_path / "data", fps=10)
+    folder = exported.path
     rows = parquet.read_table(folder / "data/chunk-000/file-000.parquet").to_pydict()
     episodes = transitions(scored)
     assert rows["next.reward"] == [float(reward) for episode in episodes for reward in episode["rewards"]]
@@ -140,7 +148,7 @@ def test_lerobot_folders_hold_a_row_per_frame_and_progress_beside_them(scored: s
     assert rows["timestamp"][101] == pytest.approx(0.1)
     info = json.loads((folder / "meta/info.json").read_text())
     assert (info["fps"], info["total_episodes"], info["total_frames"]) == (10, 4, 400)
-    assert set(info["features"]) == set(rows)
+    assert set(info["features"]) == set(rows) == set(exported.arrays)
     scores = np.concatenate([score[:-1] for score in read(scored, Dataset.scores)])
     progress = parquet.read_table(folder / "sarm_progress.parquet").to_pydict()
     np.testing.assert_array_equal(progress["zest_score"], scores)

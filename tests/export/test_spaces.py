@@ -16,8 +16,9 @@ from PIL import Image
 from pyarrow import parquet
 from read_dataset import read
 
+from zest_rl.cli.next_command import after_inspection
 from zest_rl.data.observations import is_numbers
-from zest_rl.data.reader import Dataset
+from zest_rl.data.reader import Dataset, open_dataset
 from zest_rl.errors import BadInput, Notice
 from zest_rl.export import export, transitions
 from zest_rl.export.lerobot import DATA_FILE
@@ -110,7 +111,8 @@ def test_discrete_actions_stay_whole_numbers_for_those_that_take_them(
     name = write_samples("room/buttons-v0", root, spaces.Dict(ROOM), spaces.Discrete(4))
     told = zest("relabel", name, "--goal", goal, "--n-workers", "1")
     scored = told["dataset"]
-    assert told["next"] == f"zest export {scored} --to npz"
+    with open_dataset(scored) as ds:
+        assert after_inspection(ds) == f"zest export {scored} --to npz"
     with h5py.File(root / name / "data/main_data.hdf5") as file:
         own = [file[f"episode_{i}/actions"][()] for i in range(2)]
     for to in ("npz", "d4rl"):
@@ -149,11 +151,11 @@ def test_several_whole_numbers_per_action_are_not_taken_for_one(root: Path, tmp_
     ("actions", "verb"),
     [(spaces.Box(-2, 2, (2,), np.float32), "export"), (spaces.Box(-1, 1, (2,), np.float32), "train")],
 )
-def test_relabel_names_training_where_actions_can_be_trained_on(
-    root: Path, goal: Path, zest: Callable[..., dict[str, Any]], actions: spaces.Space[Any], verb: str
+def test_training_follows_an_inspection_where_actions_can_be_trained_on(
+    root: Path, actions: spaces.Space[Any], verb: str
 ) -> None:
-    name = write_samples("room/wide-v0", root, spaces.Dict(ROOM), actions)
-    assert zest("relabel", name, "--goal", goal, "--n-workers", "1")["next"].startswith(f"zest {verb} ")
+    with open_dataset(write_samples("room/wide-v0", root, spaces.Dict(ROOM), actions)) as ds:
+        assert after_inspection(ds).startswith(f"zest {verb} ")
 
 
 def test_infos_are_not_measured_by_the_space_of_the_observations(root: Path) -> None:

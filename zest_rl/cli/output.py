@@ -15,6 +15,9 @@ from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime.address_space import is_out_of_memory
 from zest_rl.training.distributed import launched
 
+SHARES = ("clipped_actions", "expert_success")
+"""Figures in [0, 1] that are printed in percent."""
+
 
 def print_result(
     result: Mapping[str, Any], summary: Callable[[Mapping[str, Any]], str] | None, *, as_json: bool
@@ -45,14 +48,30 @@ def _listing(value: Mapping[str, Any], indent: str = "") -> list[str]:
     """Write a result as ``key: value`` lines, nested mappings indented."""
     lines = []
     for key, item in value.items():
-        if isinstance(item, Mapping):
+        if isinstance(item, Mapping) and item.keys() == {"value", "low", "high"}:
+            lines.append(f"{indent}{key}: {_estimate(key, item, value.get('n_episodes'))}")
+        elif isinstance(item, Mapping):
             lines += [f"{indent}{key}:", *_listing(item, indent + "  ")]
         elif isinstance(item, list) and any(isinstance(entry, Mapping) for entry in item):
             for index, entry in enumerate(item):
                 lines += [f"{indent}{key} {index + 1}:", *_listing(entry, indent + "  ")]
         else:
+            if key in SHARES:
+                item = f"{100 * item:.1f} %"
+            elif key == "iqm" and "normalized_return" in value:
+                item = f"{item:.1f} %"
             lines.append(f"{indent}{key}: {_cell(item)}")
     return lines
+
+
+def _estimate(key: str, estimate: Mapping[str, float], n_episodes: int | None) -> str:
+    """Write a figure with its unit and its 95 % interval."""
+    value, low, high = (estimate[name] for name in ("value", "low", "high"))
+    if key == "success" and n_episodes:
+        return f"{round(value * n_episodes)} of {n_episodes}, 95 % interval {100 * low:.0f} to {100 * high:.0f} %"
+    if key == "normalized_return":
+        return f"{value:.1f} % of the expert, 95 % interval {low:.1f} to {high:.1f} %"
+    return f"{value:.4g}, 95 % interval {low:.4g} to {high:.4g}"
 
 
 def _cell(value: object) -> str:

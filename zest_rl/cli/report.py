@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -38,3 +39,9 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "rows": {row.method: round(row.mean, 2) for row in report.items(RESULTS)},
         "next": f"open {path} in a browser",
     }
+
+
+def summary(result: Mapping[str, Any]) -> str:
+    """One line per row, as text."""
+    rows = [f"  {method:<28}{mean:>7.1f} % of the expert" for method, mean in result["rows"].items()]
+    return "\n".join([*rows, f"report: {result['report']}"])
