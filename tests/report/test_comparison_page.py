@@ -20,7 +20,7 @@ from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import EvaluationConfig, evaluate
 from zest_rl.kitchen.videos import Video
 from zest_rl.metrics import statistics
-from zest_rl.report.comparison_page import compare, dataset_row, learning_curve, method_row, return_curve
+from zest_rl.report.comparison_page import compare, dataset_row, gain, learning_curve, method_row, return_curve
 from zest_rl.report.episodes import paired_episodes
 from zest_rl.report.goals import goal_panel, goal_scatter
 from zest_rl.report.methods import Method, latest_evaluation, methods_of_runs
@@ -82,12 +82,25 @@ def test_a_report_compares_methods_with_the_dataset_and_shows_goal_episodes_and_
     assert curves[0].band is not None, "two seeds have a range"
     assert curves[1].band is None
     assert report.items(CAVEATS) == ("small",)
-    data, clone, _ = report.items(RESULTS)
+    data, clone, dt = report.items(RESULTS)
+    difference = gain([methods[0].evaluations()], [methods[1].evaluations()])
+    assert difference is not None
     assert report.summary.startswith(
-        f"Trained on the same 4 episodes, which themselves reach {data.mean:.0f} % of the expert, behaviour cloning "
-        f"reaches {clone.mean:.0f} %, and"
+        f"Trained on the same 4 episodes, which themselves reach {data.mean:.0f} % of the expert, DT on same-scene, "
+        f"which learned from a picture's rewards, reaches {dt.mean:.0f} % and behaviour cloning {clone.mean:.0f} %: "
+        f"{abs(difference.value):.1f} points {'more' if difference.value >= 0 else 'less'} from the same starts"
     )
     assert {"run bc-0", "run bc-1", "run dt-0"} <= dict(report.items(DETAILS)).keys()
+
+
+def test_a_gain_is_paired_by_start_and_over_seeds(evaluated: Path) -> None:
+    one, two, other = (latest_evaluation(evaluated / name) for name in ("bc-0", "bc-1", "dt-0"))
+    by_seed = gain([[one, two]], [[other, other]])
+    assert by_seed is not None
+    assert by_seed.value == pytest.approx((other.returns() - (one.returns() + two.returns()) / 2).mean())
+    assert gain([[one]], [[other]]) == statistics.bootstrap([other.returns() - one.returns()])
+    assert gain([[one, one]], [[other]]) == gain([[one]], [[other]]), "unequally many seeds: their means"
+    assert gain([[one]], [[replace(other, config=replace(other.config, seed=99))]]) is None
 
 
 def test_a_row_sums_up_the_episodes_of_all_its_seeds(evaluated: Path) -> None:

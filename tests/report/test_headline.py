@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from zest_rl.metrics.statistics import Estimate
 from zest_rl.report.content import Kind, MethodRow
 from zest_rl.report.headline import headline
 
@@ -37,53 +38,71 @@ METAS = {
     "without return": meta("rvs", config={"condition_on_return": False}),
     "BC on the best": meta("bc", config={"top_fraction": 0.25}),
 }
-SAME = "Trained on the same 60 episodes, which themselves reach 83 % of the expert, behaviour cloning reaches "
+SAME = "Trained on the same 60 episodes, which themselves reach 83 % of the expert, "
+PICTURE = "which learned from a picture's rewards, reaches"
+MORE, LESS = Estimate(13.2, 9.04, 17.0), Estimate(-2.12, -4.0, 0.5)
 
 
 @pytest.mark.parametrize(
-    ("rows", "sentence"),
+    ("rows", "difference", "sentence"),
     [
         (
             [row("BC", 83.1), row("ZeST+RvS", 97.4), row("ZeST+DT", 96.0)],
-            "83 % and ZeST+RvS, which learned from a picture's rewards, 97 % "
-            "(95 % intervals 81.1 to 85.1 and 95.4 to 99.4).",
+            MORE,
+            f"ZeST+DT, {PICTURE} 96 % and behaviour cloning 83 %: 13.2 points more from the same starts (95 % interval "
+            "of the difference 9.0 to 17.0).",
         ),
         (
-            [row("BC", 93.0), row("by a sentence", 95.0)],
-            "93 % and by a sentence, which learned from a sentence's rewards, 95 % "
-            "(95 % intervals 91.0 to 95.0 and 93.0 to 97.0); as these overlap, the difference may be chance.",
+            [row("BC", 99.0), row("by a sentence", 96.9)],
+            LESS,
+            "by a sentence, which learned from a sentence's rewards, reaches 97 % and behaviour cloning 99 %: 2.1 "
+            "points less from the same starts (95 % interval of the difference −4.0 to 0.5); as 0 lies in it, the "
+            "difference may be chance.",
         ),
         (
-            [row("BC", 99.0), row("ZeST+DT", 96.9), row("ZeST+RvS", 90.0)],
-            "99 %, and no method that learned from a picture's rewards is above it: ZeST+DT reaches 97 % "
-            "(95 % intervals 97.0 to 101.0 and 94.9 to 98.9).",
+            [row("BC", 83.0), row("ZeST+DT", 90.0), row("ZeST+RvS", 95.0)],
+            None,
+            f"ZeST+DT, {PICTURE} 90 % and behaviour cloning 83 %, from other starts (95 % intervals 88.0 to 92.0 and "
+            "81.0 to 85.0).",
+        ),
+        (
+            [row("BC", 83.0), row("ZeST+RvS", 86.0)],
+            None,
+            f"ZeST+RvS, {PICTURE} 86 % and behaviour cloning 83 %, from other starts (95 % intervals 84.0 to 88.0 and "
+            "81.0 to 85.0); as these overlap, the difference may be chance.",
         ),
         (
             [
                 row("BC on the best", 95.0),
                 row("BC", 83.0),
-                row("ZeST+DT", 90.0),
                 row("GT", 99.0),
                 row("shuffled", 98.0),
                 row("without return", 97.0),
+                row("ZeST+DT", 90.0, kind="control"),
+                row("ZeST+RvS", 89.0),
             ],
-            "83 % and ZeST+DT, which learned from a picture's rewards, 90 % "
-            "(95 % intervals 81.0 to 85.0 and 88.0 to 92.0).",
-        ),
-        (
-            [row("BC", 83.0), row("ZeST+DT", 90.0), row("ZeST+RvS", 99.0, kind="control")],
-            "83 % and ZeST+DT, which learned from a picture's rewards, 90 % "
-            "(95 % intervals 81.0 to 85.0 and 88.0 to 92.0).",
+            MORE,
+            f"ZeST+RvS, {PICTURE} 89 % and behaviour cloning 83 %: 13.2 points more from the same starts (95 % "
+            "interval of the difference 9.0 to 17.0).",
         ),
     ],
-    ids=["above", "within the intervals", "not above", "other rewards do not count", "controls do not count"],
+    ids=["the highest is not asked about", "less", "other starts", "overlap", "other rewards and controls"],
 )
-def test_the_best_of_zest_rewards_is_compared_with_cloning(rows: Sequence[MethodRow], sentence: str) -> None:
-    assert headline([DATA, *rows], METAS) == SAME + sentence
+def test_the_decision_transformer_on_zest_rewards_is_compared_with_cloning(
+    rows: Sequence[MethodRow], difference: Estimate | None, sentence: str
+) -> None:
+    asked = []
+
+    def gain(before: str, after: str) -> Estimate | None:
+        asked.append((before, after))
+        return difference
+
+    assert headline([DATA, *rows], METAS, gain) == SAME + sentence
+    assert asked == [("BC", sentence.split(",")[0])]
 
 
 def test_several_datasets_are_told() -> None:
-    told = headline([DATA, row("BC", 83.0), row("ZeST+DT", 90.0)], METAS, n_datasets=6)
+    told = headline([DATA, row("BC", 83.0), row("ZeST+DT", 90.0)], METAS, lambda *_: MORE, n_datasets=6)
     assert told.startswith("Trained on the same 60 episodes of 6 datasets, which")
 
 
@@ -92,7 +111,7 @@ def test_several_datasets_are_told() -> None:
 )
 def test_without_the_dataset_or_cloning_the_best_method_is_told(without: Callable[[MethodRow], bool]) -> None:
     rows = [each for each in (DATA, row("BC", 83.0), row("GT", 92.0), row("ZeST+DT", 90.0)) if not without(each)]
-    assert headline(rows, METAS) == (
+    assert headline(rows, METAS, lambda *_: MORE) == (
         "GT reaches 92.0 % of the expert's return (95 % interval 90.0 to 94.0, 1 seed, 20 episodes)."
     )
-    assert headline([], {}) == ""
+    assert headline([], {}, lambda *_: MORE) == ""

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from markupsafe import escape
 
 from zest_rl.errors import BadInput
-from zest_rl.report.charts import axis_over
+from zest_rl.report.charts import axis_over, correlation_gauge, interval_bar, results_axis
 from zest_rl.report.content import (
     Curve,
     EpisodePanel,
@@ -188,6 +188,28 @@ def test_a_matrix_has_a_row_per_task_and_the_highest_of_each_goal_in_bold(report
             ],
         ),
     ]
+
+
+def test_sentences_show_their_markdown_and_escape_the_rest() -> None:
+    sentences = (
+        "See [the *page*](https://example.org/a_b?c=1&d) and [findings](docs/findings.md), `zest a *b* <c>`.",
+        '**Three** seeds, 2 * 3 * 4 episodes <b>each</b>; [no](javascript:alert(1)) [quote](https://a.b/"onclick=)',
+    )
+    html = render_html(Report("T", "S", (CAVEATS(sentences),)))
+    first, second = re.findall(r"<li>(.*?)</li>", html)
+    assert first == (
+        'See <a href="https://example.org/a_b?c=1&amp;d">the <em>page</em></a> and findings, '
+        "<code>zest a *b* &lt;c&gt;</code>."
+    )
+    assert second.startswith("<strong>Three</strong> seeds, 2 * 3 * 4 episodes &lt;b&gt;each&lt;/b&gt;; no")
+    assert second.endswith('<a href="https://a.b/&#34;onclick=">quote</a>')
+    assert "javascript" not in second
+
+
+def test_an_interval_narrower_than_its_dot_has_end_caps_and_a_correlation_has_a_scale() -> None:
+    row = MethodRow("BC", 90.0, 89.9, 90.1, 90.0, 1.0, 1, 20)
+    assert interval_bar(row, results_axis([row])).count('class="ci"') == 3
+    assert re.findall(r">([−\d]+)</text>", correlation_gauge(0.5)) == ["−1", "0", "1"]
 
 
 def test_an_empty_report_has_no_sections() -> None:
@@ -419,7 +441,9 @@ CURSOR = '[...document.querySelector(".scrubber").querySelectorAll(".cursor")].m
 def test_in_a_browser_video_and_chart_follow_each_other(browser: Browser) -> None:
     browser.evaluate(WAIT_UNTIL % "document.querySelector('video').readyState === 4")
     assert browser.evaluate('document.querySelector("video").videoWidth') == 64
-    assert browser.evaluate(STEP) == 0
+    assert browser.evaluate(STEP) == 30, "how the episode ended is what is seen first"
+    browser.evaluate(WAIT_UNTIL % "!document.querySelector('video').seeking")
+    assert browser.evaluate(SHOWN_GREY) == pytest.approx(GREY + GREY_PER_STEP * 30, abs=GREY_PER_STEP / 2)
 
     browser.evaluate(SEEK % "1.25")
     assert browser.evaluate(STEP) == 12

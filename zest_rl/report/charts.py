@@ -99,14 +99,15 @@ def results_axis(rows: Sequence[MethodRow]) -> Axis:
 
 
 def interval_bar(row: MethodRow, axis: Axis) -> Markup:
-    """Return the mean as a dot on its 95 % interval, with the paper's figure as a diamond below it."""
+    """Return the mean as a dot on its 95 % interval with end caps, with the paper's figure as a diamond below it."""
     parts = [f'<line class="grid" x1="{axis.percent(t):.2f}%" x2="{axis.percent(t):.2f}%" y1="0" y2="100%"/>'
              for t in axis.ticks]  # fmt: skip
     if math.isfinite(row.ci_low) and math.isfinite(row.ci_high):
         low, high = axis.percent(row.ci_low), axis.percent(row.ci_high)
         parts.append(f'<line class="ci" x1="{low:.2f}%" x2="{high:.2f}%" y1="50%" y2="50%"/>')
+        parts += [f'<line class="ci" x1="{at:.2f}%" x2="{at:.2f}%" y1="30%" y2="70%"/>' for at in (low, high)]
     if math.isfinite(row.mean):
-        parts.append(f'<circle class="mean" cx="{axis.percent(row.mean):.2f}%" cy="50%" r="5"/>')
+        parts.append(f'<circle class="mean" cx="{axis.percent(row.mean):.2f}%" cy="50%" r="3"/>')
     unit, digits = (" %", 1) if row.is_normalized else ("", 2)
     mean, lowest, highest = (number(value, digits) for value in (row.mean, row.ci_low, row.ci_high))
     label = f"mean {mean}{unit}, 95 % interval {lowest} to {highest}{unit}"
@@ -132,14 +133,17 @@ def level_bar(score: float) -> Markup:
 
 
 def correlation_gauge(value: float) -> Markup:
-    """Return a correlation as a dot between −1 and 1."""
+    """Return a correlation as a dot on a scale from −1 to 1."""
     axis = Axis(-1, 1, (-1, 0, 1))
     at, zero = axis.percent(value), axis.percent(0)
+    ticks = "".join(
+        f'<text class="x tick" x="{axis.percent(t):.2f}%" y="100%" dy="1em">{axis.label(t)}</text>' for t in axis.ticks
+    )
     return Markup(
         '<svg class="gauge" aria-hidden="true"><line class="rail" x1="0" x2="100%" y1="50%" y2="50%"/>'
         f'<line class="ci" x1="{zero:.2f}%" x2="{at:.2f}%" y1="50%" y2="50%"/>'
         f'<line class="zero" x1="{zero:.2f}%" x2="{zero:.2f}%" y1="15%" y2="85%"/>'
-        f'<circle class="mean" cx="{at:.2f}%" cy="50%" r="5"/></svg>'
+        f'<circle class="mean" cx="{at:.2f}%" cy="50%" r="5"/>{ticks}</svg>'
     )
 
 

@@ -18,7 +18,7 @@ from zest_rl.data.reader import dataset_path, exists, open_dataset
 from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import Evaluation, evaluation_folder, read_evaluation
 from zest_rl.kitchen.videos import Film, ensure_video
-from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return
+from zest_rl.metrics.statistics import Estimate, bootstrap, iqm, normalized_return
 from zest_rl.report.content import Curve, MethodRow, TaskTable
 from zest_rl.report.episodes import paired_episodes, representative_episodes
 from zest_rl.report.goals import goal_panel, goal_scatter
@@ -79,6 +79,25 @@ def dataset_row(*dataset_ids: str, paper: float | None = None, is_normalized: bo
         paper_value=paper,
         is_normalized=is_normalized,
     )
+
+
+def gain(before: Sequence[Sequence[Evaluation]], after: Sequence[Sequence[Evaluation]]) -> Estimate | None:
+    """Estimate what one method returns more than another from the same starts, in percent; None if these differ.
+
+    Args:
+        before: evaluations of one method: per task, one per seed.
+        after: of the other. With as many seeds, seed is paired with seed, else the means over seeds.
+    """
+    differences = []
+    for task_before, task_after in zip(before, after, strict=True):
+        played = [(each.config.starts, each.environment) for each in (*task_before, *task_after)]
+        if any(each != played[0] for each in played):
+            return None
+        groups = [[each.returns() for each in evaluations] for evaluations in (task_before, task_after)]
+        if len(groups[0]) != len(groups[1]):
+            groups = [[np.mean(group, axis=0)] for group in groups]
+        differences.append([b - a for a, b in zip(*groups, strict=True)])
+    return bootstrap(*differences)
 
 
 def _row(groups: list[list[NDArray[np.float64]]], successes: Sequence[bool | None], **named: Any) -> MethodRow:
@@ -250,7 +269,11 @@ def compare(
     curves = (draw(method) for draw in (return_curve, learning_curve) for method in methods)
     return Report(
         title,
-        headline(rows, {method.name: metas[str(method.runs[0])] for method in methods}),
+        headline(
+            rows,
+            {method.name: metas[str(method.runs[0])] for method in methods},
+            lambda before, after: gain([evaluations[before]], [evaluations[after]]),
+        ),
         (
             RESULTS(rows),
             CAVEATS([*caveats, *_unequal_starts(evaluations)]),
@@ -286,15 +309,16 @@ def overview(
         caveats: sentences below the results.
         details: name → JSON, in collapsed blocks.
     """
-    by_name = zip(*methods.values(), strict=True)
-    rows = [method_row(group[0], *(method.evaluations() for method in group)) for group in by_name]
+    by_name = [*zip(*methods.values(), strict=True)]
+    evaluations = {group[0].name: [method.evaluations() for method in group] for group in by_name}
+    rows = [method_row(group[0], *evaluations[group[0].name]) for group in by_name]
     rows.insert(0, dataset_row(*sources, paper=paper_demo))
     metas = {method.name: read_meta(method.runs[0]) for method in next(iter(methods.values()))}
     scatters = [(task, scatter) for task, report in reports.items() for scatter in report.items(RANKING)]
     curves = [(task, curve) for task, report in reports.items() for curve in report.items(LEARNING_CURVES)]
     return Report(
         title,
-        headline(rows, metas, len(reports)),
+        headline(rows, metas, lambda before, after: gain(evaluations[before], evaluations[after]), len(reports)),
         (
             RESULTS(rows),
             TASK_TABLES(TaskTable(task, report.items(RESULTS), pages[task]) for task, report in reports.items()),

@@ -1,23 +1,29 @@
-"""The sentence that a comparison opens with, computed from its rows: what learning from rewards gained over cloning."""
+"""The sentence that a comparison opens with: what learning from rewards gains over cloning, from the same starts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from zest_rl.data.provenance import DatasetRecord
+from zest_rl.metrics.statistics import Estimate
 from zest_rl.report.content import MethodRow
 from zest_rl.rewards.goals import TASK_TEXT, TEXT
 
+Gain = Callable[[str, str], Estimate | None]
+"""What the second method returns more than the first from the same starts; None if these differ."""
 
-def headline(rows: Sequence[MethodRow], metas: Mapping[str, Mapping[str, Any]], n_datasets: int = 1) -> str:
-    """Compare the best method that learned from ZeST rewards with behaviour cloning, and say so where it is no better.
 
-    Where one of the two or the dataset is missing, tell what the best method reaches.
+def headline(rows: Sequence[MethodRow], metas: Mapping[str, Mapping[str, Any]], gain: Gain, n_datasets: int = 1) -> str:
+    """Compare the method that is asked about with behaviour cloning: the first Decision Transformer on ZeST rewards.
+
+    Where there is none, the first method on such rewards; where cloning or the dataset is missing, too, tell what the
+    best method reaches.
 
     Args:
         rows: of the results.
         metas: ``meta.json`` of a run, by the name of its method.
+        gain: see `Gain`.
         n_datasets: over which the results are.
     """
     contenders = [row for row in rows if row.kind == "method"]
@@ -26,20 +32,27 @@ def headline(rows: Sequence[MethodRow], metas: Mapping[str, Mapping[str, Any]], 
     data = next((row for row in rows if row.kind == "dataset"), None)
     clone = next((row for row in contenders if _clones_all(metas[row.method])), None)
     givers = {row.method: _giver(metas[row.method]) for row in contenders}
-    best = max((row for row in contenders if givers[row.method]), key=lambda row: row.mean, default=None)
-    if data is None or clone is None or best is None:
+    learners = sorted((row for row in contenders if givers[row.method]), key=lambda r: metas[r.method]["agent"] != "dt")
+    if data is None or clone is None or not learners:
         return _best_sentence(contenders, n_datasets)
+    asked = learners[0]
     where = f" of {n_datasets} datasets" if n_datasets > 1 else ""
     episodes = f"{data.n_episodes} episodes{where}, which themselves reach {data.mean:.0f} % of the expert"
-    trained = f"Trained on the same {episodes}, behaviour cloning reaches {clone.mean:.0f} %"
-    intervals = f"(95 % intervals {_interval(clone)} and {_interval(best)})"
-    rewards = f"learned from {givers[best.method]}'s rewards"
-    if best.mean <= clone.mean:
-        return (
-            f"{trained}, and no method that {rewards} is above it: {best.method} reaches {best.mean:.0f} % {intervals}."
-        )
-    doubt = "" if best.ci_low > clone.ci_high else "; as these overlap, the difference may be chance"
-    return f"{trained} and {best.method}, which {rewards}, {best.mean:.0f} % {intervals}{doubt}."
+    reached = (
+        f"Trained on the same {episodes}, {asked.method}, which learned from {givers[asked.method]}'s rewards, reaches "
+        f"{asked.mean:.0f} % and behaviour cloning {clone.mean:.0f} %"
+    )
+    difference = gain(clone.method, asked.method)
+    if difference is None:
+        overlap = asked.ci_low <= clone.ci_high and clone.ci_low <= asked.ci_high
+        doubt = "; as these overlap, the difference may be chance" if overlap else ""
+        return f"{reached}, from other starts (95 % intervals {_interval(asked)} and {_interval(clone)}){doubt}."
+    doubt = "; as 0 lies in it, the difference may be chance" if difference.low <= 0 <= difference.high else ""
+    low, high = (f"{value:z.1f}".replace("-", "\u2212") for value in (difference.low, difference.high))
+    return (
+        f"{reached}: {abs(difference.value):.1f} points {'more' if difference.value >= 0 else 'less'} from the same "
+        f"starts (95 % interval of the difference {low} to {high}){doubt}."
+    )
 
 
 def _best_return(contenders: Sequence[MethodRow]) -> str:

@@ -11,13 +11,14 @@ import hashlib
 import io
 import json
 import math
+import re
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from PIL import Image
 
 from zest_rl.errors import BadInput
@@ -28,6 +29,14 @@ from zest_rl.runtime import artifacts
 from zest_rl.runtime.privacy import masked
 from zest_rl.types import Frame
 
+_CODE = re.compile(r"`([^`]+)`")
+_MARKS = (
+    (re.compile(r"\[([^\]]+)\]\((https?://[^)\s]+)\)"), r'<a href="\2">\1</a>'),
+    (re.compile(r"\[([^\]]+)\]\([^)\s]+\)"), r"\1"),
+    (re.compile(r"\*\*(?=\S)(.+?)(?<=\S)\*\*"), r"<strong>\1</strong>"),
+    (re.compile(r"\*(?=\S)(.+?)(?<=\S)\*"), r"<em>\1</em>"),
+)
+"""Of Markdown, what may stand in a sentence."""
 THUMBNAIL = 160
 """Longest side of an embedded goal image, in pixels."""
 
@@ -51,6 +60,7 @@ def render_html(report: Report) -> str:
         "percent": _percent,
         "returned": lambda value, is_normalized: _percent(value) if is_normalized else number(value),
         "counted": _counted,
+        "markdown": _markdown,
         "png": _png,
         "mp4": _mp4,
         "json": _json,
@@ -91,6 +101,20 @@ def _interval(low: float, high: float, digits: int) -> str:
 
 def _counted(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def _markdown(text: str) -> Markup:
+    """Return a sentence with its code, links to the web and emphasis as HTML; other links are their text alone."""
+    parts = _CODE.split(text)
+    for i, part in enumerate(parts):
+        safe = str(escape(part))
+        if i % 2:
+            parts[i] = f"<code>{safe}</code>"
+            continue
+        for pattern, replacement in _MARKS:
+            safe = pattern.sub(replacement, safe)
+        parts[i] = safe
+    return Markup("".join(parts))
 
 
 def _data_uri(mime: str, data: bytes) -> str:

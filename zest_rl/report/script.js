@@ -58,8 +58,12 @@ function connect(episode) {
   }
 
   function toggle() {
-    if (video.paused) video.play().catch(() => {}); // a video that cannot play reports it through "error"
-    else video.pause();
+    if (!video.paused) {
+      video.pause();
+      return;
+    }
+    if (current === last) video.currentTime = 0;
+    video.play().catch(() => {}); // a video that cannot play reports it through "error"
   }
 
   function seekToPointer(event) {
@@ -104,7 +108,7 @@ function connect(episode) {
   button.addEventListener("click", toggle);
   video.controls = false;
   episode.querySelector(".transport").hidden = false;
-  show(0);
+  seek(last); // how it ended; playing starts over
 }
 
 document.querySelectorAll(".episode").forEach(connect);
