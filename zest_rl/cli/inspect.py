@@ -31,6 +31,8 @@ class Config:
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Measure, judge, write the page."""
     from zest_rl.analysis.cross_task import inspect_datasets
+    from zest_rl.cli.next_command import after_inspection
+    from zest_rl.data.reader import open_dataset
     from zest_rl.report.html import write_report
     from zest_rl.report.inspection_page import inspection_report
 
@@ -41,7 +43,12 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     for sentence in inspected.left_out:
         ui.warn(sentence)
     page = write_report(inspection_report(inspected), config.output)
-    return {**inspected.to_json(), "report": str(page), "next": f"open {page} in a browser"}
+    command = f"open {page} in a browser"
+    usable = [name for name, verdict in inspected.verdicts.items() if verdict.advice != "do not"]
+    if usable:
+        with open_dataset(usable[0]) as ds:
+            command = after_inspection(ds)
+    return {**inspected.to_json(), "report": str(page), "next": command}
 
 
 def summary(result: Mapping[str, Any]) -> str:
