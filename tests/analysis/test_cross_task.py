@@ -132,6 +132,7 @@ def test_the_verb_prints_figures_warns_and_leaves_a_page(
     assert not any("shuffled?" in warning for warning in result["warnings"][scored])
     assert result["goals_against_tasks"] is None, "both are of one task"
     page = (tmp_path / "page.html").read_text()
+    assert page.count("data:video/mp4") == 2
     assert page.count('class="strip"') == 2, "best and worst; the shuffled scores are not those of what is seen"
     assert page.index("these are the scores of other episodes") < page.index("<h2>Warnings</h2>")
     for heading in (

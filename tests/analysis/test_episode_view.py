@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from read_dataset import read
 
-from zest_rl.analysis.episode_view import N_FRAMES, EpisodeView
+from zest_rl.analysis.episode_view import N_FRAMES, KitchenView
 from zest_rl.data.reader import Dataset
 from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.rewards.scorer import ScorerConfig
@@ -22,7 +22,7 @@ def test_an_episode_is_shown_with_its_scores_by_view_and_its_change_in_pixels(
 ) -> None:
     states = read(collected, Dataset.states)[0]
     scorer = StateScorer.build(ScorerConfig(goal, features=features), VIEWS, states[0], n_workers=1)
-    view = EpisodeView(scorer, states)
+    view = KitchenView(scorer, states)
     np.testing.assert_allclose(view.scores, scorer.score_episode(states), atol=1e-6)
     assert view.by_view.shape == (2, len(states))
     assert not np.allclose(*view.by_view)

@@ -103,4 +103,6 @@ def test_policies_are_trained_on_it_it_is_exported_and_inspected_and_not_evaluat
     still = [score[1:] == 0 for score in read(made, Dataset.scores)]
     assert sum(map(np.sum, still)) == read(made, lambda ds: ds.metadata)["zest"]["relabel"]["n_still_frames"]
     assert figures["still"]["value"] == pytest.approx(np.mean([episode.mean() for episode in still]))
-    assert made in (tmp_path / "page.html").read_text()
+    page = (tmp_path / "page.html").read_text()
+    assert made in page
+    assert (page.count('class="strip"'), page.count("data:video/mp4")) == (2, 2), "its pictures are in the dataset"

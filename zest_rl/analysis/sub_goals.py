@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.analysis.clips import Clip, embed_clips
-from zest_rl.analysis.episode_view import N_FRAMES, EpisodeView
+from zest_rl.analysis.episode_view import N_FRAMES, KitchenView
 from zest_rl.analysis.reward_figures import FLAT
 from zest_rl.data.images import read_image
 from zest_rl.data.video import evenly_spaced, read_frames
@@ -139,7 +139,7 @@ def follow_kitchen(
     for task, done_at in performance.done_at.items():
         cameras = Views(task, views, tolerance=tolerance)
         scorer = StateScorer.build(config, cameras, performance.states[0], device=device, n_workers=n_workers)
-        view = EpisodeView(scorer, performance.states)
+        view = KitchenView(scorer, performance.states)
         sub_goals.append(SubGoalScores(task, view.scores, tuple(view.frames), view.steps, done_at))
         on_progress(len(sub_goals), len(tasks))
     return sub_goals

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-from zest_rl.report.content import Curve, EpisodePanel, MethodRow, Scatter
+from zest_rl.report.content import Curve, EpisodePanel, Film, MethodRow, Scatter
 from zest_rl.types import FloatArray
 
 MISSING = "–"
@@ -258,14 +258,14 @@ def curve_chart(quantity: str, curves: Sequence[Curve], styles: Sequence[str]) -
     return line_chart(lines, f"{quantity} of {', '.join(curve.name for curve in curves)}")
 
 
-def score_range(episodes: Iterable[EpisodePanel]) -> tuple[float, float]:
+def score_range(episodes: Iterable[EpisodePanel | Film]) -> tuple[float, float]:
     """Return the lowest and the highest finite score of all episodes; the range includes 0."""
     scores = [e.scores[np.isfinite(e.scores)] for e in episodes if e.scores is not None]
     values = np.concatenate([*scores, np.zeros(1)])
     return float(values.min()), float(values.max())
 
 
-def score_chart(panel: EpisodePanel, y_holds: tuple[float, float]) -> Markup:
+def score_chart(panel: EpisodePanel | Film, y_holds: tuple[float, float]) -> Markup:
     """Return the scores of an episode, on a y axis that covers `y_holds`."""
     assert panel.scores is not None
     label = f"ZeST score over {len(panel.scores) - 1} steps of {panel.title}"

@@ -129,6 +129,19 @@ class EpisodePanel:
 
 
 @dataclass(frozen=True)
+class Film:
+    """An episode of a dataset: its video and its scores."""
+
+    title: str
+    video: bytes
+    """MP4 with H.264 video."""
+    fps: float
+    """Steps per second of video."""
+    scores: FloatArray
+    """(T+1,) float32."""
+
+
+@dataclass(frozen=True)
 class Scatter:
     """One point for each episode of a dataset, or for whatever `point` names."""
 

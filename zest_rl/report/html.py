@@ -129,14 +129,18 @@ def _png(frame: Frame) -> str:
     return _data_uri("image/png", buffer.getvalue())
 
 
-def _mp4(path: Path) -> str:
+def _mp4(video: Path | bytes) -> str:
+    return _data_uri("video/mp4", video if isinstance(video, bytes) else _read_mp4(video))
+
+
+def _read_mp4(path: Path) -> bytes:
     try:
         data = path.read_bytes()
     except OSError as error:
         raise BadInput(f"cannot read the video {path}: {error.strerror}; evaluate again with videos") from error
     if data[4:8] != b"ftyp" or b"avc1" not in data:
         raise BadInput(f"{path} must be an MP4 file with H.264 video, which browsers play; encode it with libx264")
-    return _data_uri("video/mp4", data)
+    return data
 
 
 def _sha256(text: str) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -14,10 +16,11 @@ from zest_rl.analysis.inspection import Inspection, labels
 from zest_rl.analysis.reward_figures import FIGURES
 from zest_rl.data.reader import dataset_path
 from zest_rl.metrics.statistics import MIN_EPISODES_TO_RANK, spearman
-from zest_rl.report.content import Curve, QualityRow, QualityTable, Scatter, ScoreMatrix, Strip
+from zest_rl.report.content import Curve, Film, QualityRow, QualityTable, Scatter, ScoreMatrix, Strip
 from zest_rl.report.goals import goal_panel, return_scatter
 from zest_rl.report.sections import (
     DETAILS,
+    FILMS,
     FRAMES,
     GOALS,
     PIXELS,
@@ -57,6 +60,7 @@ def inspection_report(joint: JointInspection) -> Report:
             ),
             RANKING(scatter for scatter in scatters.values() if scatter is not None),
             FRAMES(strip for name in views for strip in _strips(name, inspections[name], views[name])),
+            FILMS(film for name in views for film in _films(name, views[name])),
             VIEWS(curve for name in views for curve in _by_view(name, views[name]["best"])),
             PIXELS(_pixels(name, views[name]["best"]) for name in views),
             SCORES_OVER_TIME(curve for name, each in inspections.items() for curve in _over_time(name, each)),
@@ -91,7 +95,19 @@ def _strips(name: str, inspection: Inspection, views: Mapping[str, EpisodeView])
     ]
 
 
+def _films(name: str, views: Mapping[str, EpisodeView]) -> list[Film]:
+    films = []
+    with TemporaryDirectory() as folder:
+        for which, view in views.items():
+            path = Path(folder) / f"{which}.mp4"
+            fps = view.write_video(path)
+            films.append(Film(f"{name}: {which}", path.read_bytes(), fps, view.scores))
+    return films
+
+
 def _by_view(name: str, view: EpisodeView) -> list[Curve]:
+    if not len(view.by_view):
+        return []
     steps = np.arange(len(view.scores), dtype=np.float32)
     curves = {"all views": view.scores, **{f"view {i}": scores for i, scores in enumerate(view.by_view, 1)}}
     return [Curve(label, f"{name}: score", steps, scores) for label, scores in curves.items()]

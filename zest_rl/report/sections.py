@@ -13,6 +13,7 @@ from zest_rl.analysis.verdict import Verdict
 from zest_rl.report.content import (
     Curve,
     EpisodePanel,
+    Film,
     GoalPanel,
     MethodRow,
     QualityTable,
@@ -135,6 +136,11 @@ EPISODES = SectionKind[EpisodePanel](
     "Episodes",
     "episodes.html",
     "Drag in a chart, or focus it and press the arrow keys, to move through the video; space plays.",
+)
+FILMS = SectionKind[Film](
+    "Videos",
+    "films.html",
+    "The best and the worst episode by return. Drag in a chart, or focus it and press the arrow keys; space plays.",
 )
 LEARNING_CURVES = SectionKind[Curve](
     "Learning curves",

@@ -30,7 +30,8 @@ from zest_rl.sources.stage import SIZE, Pose, Simulation, env_facts, stage_of
 from zest_rl.types import Frame, check_finite
 
 _VERSION = 2  # raise it when a pixel changes, here or in stage.py: cached embeddings depend on it
-_DEFAULT_CAMERA = "the environment's own camera"
+DEFAULT_CAMERA = "the environment's own camera"
+"""Name of its view."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class States:
     @property
     def views(self) -> Sequence[str]:
         """Names of the cameras."""
-        return self.cameras or (_DEFAULT_CAMERA,)
+        return self.cameras or (DEFAULT_CAMERA,)
 
     def describe(self) -> dict[str, Any]:
         """Where the states come from, and how they are rendered."""
