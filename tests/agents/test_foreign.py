@@ -259,6 +259,7 @@ def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(site))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("plugin", "short_videos")
 def test_a_registered_policy_works_in_every_verb_beside_ours(
     trained: Path, adopt: Callable[..., Path], zest: Verb, tmp_path: Path

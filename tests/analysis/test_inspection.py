@@ -175,7 +175,7 @@ def test_labels_tell_what_differs() -> None:
         return RelabelRecord(**{"source": "", "source_sha256": "", "reward": "level", "scorer": scorer, **of_rewards})
 
     def named(*records: RelabelRecord) -> list[str]:
-        nothing = (Verdict("do not", "", {}), {}, (), {}, np.zeros(0), None, (0.0, 1.0), None)
+        nothing = (Verdict("do not", "", {}), {}, (), {}, np.zeros(0), None, (0.0, 1.0), None, True)
         return labels([Inspection(f"zest/{i}", "micro", record, *nothing) for i, record in enumerate(records)])
 
     assert named(made()) == ["micro by same-scene"]

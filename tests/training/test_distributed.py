@@ -35,7 +35,8 @@ def weights(run_dir: Path) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ("agent", "n_networks"), [pytest.param("bc", 1, marks=pytest.mark.slow), ("dt", 1), ("rvs", 2)]
+    ("agent", "n_networks"),
+    [pytest.param("bc", 1, marks=pytest.mark.slow), pytest.param("dt", 1, marks=pytest.mark.slow), ("rvs", 2)],
 )
 def test_two_processes_train_what_one_does(agent: str, n_networks: int, collected: str, tmp_path: Path) -> None:
     words = [
@@ -68,6 +69,7 @@ def test_two_processes_train_what_one_does(agent: str, n_networks: int, collecte
     assert float(losses[0]) == pytest.approx(float(losses[1]), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_run_of_two_that_was_killed_goes_on_and_ends_as_one_that_was_not(collected: str, tmp_path: Path) -> None:
     words = ["bc", collected, "--n-updates", 600, "--batch-size", 64, "--dropout", 0.1, "--checkpoint-every", 20]
     cut = tmp_path / "cut"

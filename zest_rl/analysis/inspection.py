@@ -47,6 +47,8 @@ class Inspection:
     """The lowest and the highest score of any frame."""
     states: list[NDArray[np.float64]] | None
     """(T+1, nq) simulator positions per episode; None outside the kitchen."""
+    suits_agents: bool
+    """Whether the package's agents can learn from it."""
 
     def known_figures(self) -> dict[str, Estimate | None]:
         """Return the figures by key, None where one is undefined, as for constant scores."""
@@ -74,6 +76,7 @@ def inspect(dataset_id: str) -> Inspection:
             views = None if record.scorer.views is None else Views.from_record(record.scorer.views)
         states = None if views is None else ds.states()
         truth = ds.truth() if ds.has_truth else None
+        suits_agents = ds.suits_agents
     frames, still = None, None
     if views is not None and states is not None:
         rendered = [canonical_states(episode, views) for episode in states]
@@ -99,6 +102,7 @@ def inspect(dataset_id: str) -> Inspection:
         None if truth is None else true_returns(truth),
         (float(min(map(np.min, scores))), float(max(map(np.max, scores)))),
         states,
+        suits_agents,
     )
 
 

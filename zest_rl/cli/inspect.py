@@ -31,8 +31,6 @@ class Config:
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Measure, judge, write the page."""
     from zest_rl.analysis.cross_task import inspect_datasets
-    from zest_rl.cli.next_command import after_inspection
-    from zest_rl.data.reader import open_dataset
     from zest_rl.report.html import write_report
     from zest_rl.report.inspection_page import inspection_report
 
@@ -44,10 +42,10 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         ui.warn(sentence)
     page = write_report(inspection_report(inspected), config.output)
     command = f"open {page} in a browser"
-    usable = [name for name, verdict in inspected.verdicts.items() if verdict.advice != "do not"]
-    if usable:
-        with open_dataset(usable[0]) as ds:
-            command = after_inspection(ds)
+    usable = (each for each in inspected.inspections if each.verdict.advice != "do not")
+    if first := next(usable, None):
+        name = first.dataset_id
+        command = f"zest train dt {name}" if first.suits_agents else f"zest export {name} --to npz"
     return {**inspected.to_json(), "report": str(page), "next": command}
 
 

@@ -38,7 +38,7 @@ from zest_rl.data.folders import datasets_root as datasets_root
 from zest_rl.data.folders import exists as exists
 from zest_rl.data.folders import list_datasets as list_datasets
 from zest_rl.data.hdf5 import mapped_errors, open_hdf5, read_array
-from zest_rl.data.observations import entries, is_numbers, joined, stored_rows
+from zest_rl.data.observations import acts_discretely, entries, is_numbers, joined, stored_rows
 from zest_rl.data.picture_forms import PictureForm, form_of
 from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput
@@ -144,6 +144,16 @@ class Dataset:
         if not all(any(name in group for name in SUCCESS) for group in self.groups.values()):
             return None
         return self._each(read)
+
+    @property
+    def suits_agents(self) -> bool:
+        """Whether the package's agents can learn from it: numbers are observed, actions are continuous in [-1, 1]."""
+        return all(
+            any(map(is_numbers, entries(group["observations"]).values()))
+            and not acts_discretely(group)
+            and np.abs(group["actions"][()]).max() <= 1
+            for group in self.groups.values()
+        )
 
     @property
     def is_hand_rewarded(self) -> bool:
