@@ -23,7 +23,7 @@ from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import Evaluation, read_evaluation
 from zest_rl.kitchen.scene import RenderConfig, open_renderer
 from zest_rl.kitchen.videos import FPS, OVERVIEW
-from zest_rl.report.charts import axis_over
+from zest_rl.report.charts import Axis, axis_over
 from zest_rl.report.content import GoalPanel
 from zest_rl.report.goals import goal_panel
 from zest_rl.runtime import artifacts
@@ -60,8 +60,8 @@ def scored_highest(output: Path) -> tuple[Evaluation, int]:
     return scored[best], int(returns[best].argmax())
 
 
-def draw_background(goal: GoalPanel, scores: FloatArray) -> Image.Image:
-    """Draw what does not move: the goal's pictures and the axes, for scores (T+1,)."""
+def draw_background(goal: GoalPanel, axis: Axis, n_steps: int) -> Image.Image:
+    """Draw what does not move: the goal's pictures and the axes, that of the scores and that of the steps."""
     image = Image.new("RGB", SIZE, "white")
     draw, font = ImageDraw.Draw(image), ImageFont.load_default(14)
     width = N_PICTURES * PICTURE
@@ -70,26 +70,24 @@ def draw_background(goal: GoalPanel, scores: FloatArray) -> Image.Image:
         for k, frame in enumerate(frames[:: max(1, len(frames) // N_PICTURES)][:N_PICTURES]):
             picture = Image.fromarray(frame).resize((PICTURE - 2, PICTURE - 2), Image.Resampling.LANCZOS)
             image.paste(picture, (left + k * PICTURE + 1, GAP + 20))
-    x, y = (width + SIZE[0] - width) // 2, GAP + 20 + PICTURE // 2
+    x, y = SIZE[0] // 2, GAP + 20 + PICTURE // 2
     draw.line((x - 14, y, x + 10, y), INK, 3)
     draw.polygon(((x + 16, y), (x + 6, y - 6), (x + 6, y + 6)), INK)
 
     x0, y0, x1, y1 = PLOT
     draw.text(((x0 + x1) / 2, y0 - 14), "ZeST score of each frame", INK, font, anchor="mb")
     draw.text(((x0 + x1) / 2, SIZE[1] + 2), "step", INK, font, anchor="mb")
-    axis = axis_over([0.0, *scores], 4, 0.05)
     for tick in axis.ticks:
         level = y1 - (y1 - y0) * axis.percent(tick) / 100
         draw.line((x0, level, x1, level), PALE)
         draw.text((x0 - 6, level), axis.label(tick), INK, font, anchor="rm")
-    for step in range(0, len(scores), 25):
-        draw.text((x0 + (x1 - x0) * step / (len(scores) - 1), y1 + 6), str(step), INK, font, anchor="ma")
+    for step in range(0, n_steps + 1, 25):
+        draw.text((x0 + (x1 - x0) * step / n_steps, y1 + 6), str(step), INK, font, anchor="ma")
     return image
 
 
-def curve_points(scores: FloatArray) -> list[tuple[float, float]]:
+def curve_points(scores: FloatArray, axis: Axis) -> list[tuple[float, float]]:
     """Return where each of the scores (T+1,) stands, in pixels from the corner of the plot."""
-    axis = axis_over([0.0, *scores], 4, 0.05)
     width, height = PLOT[2] - PLOT[0], PLOT[3] - PLOT[1]
     steps = len(scores) - 1
     return [(width * t / steps, height * (1 - axis.percent(float(v)) / 100)) for t, v in enumerate(scores)]
@@ -117,7 +115,8 @@ def main(output: Path = Path("runs/demo"), path: Path = Path("docs/images/demo.w
     dataset = DatasetRecord.of_run(artifacts.read_json(evaluation.run / "meta.json"))
     goal = goal_panel("", dataset.relabel, dataset_path(dataset.id))
     states, scores = evaluation.traces["qpos"][index], evaluation.traces["score"][index]
-    background, points = draw_background(goal, scores), curve_points(scores)
+    axis = axis_over([0.0, *scores], 4, 0.05)
+    background, points = draw_background(goal, axis, len(scores) - 1), curve_points(scores, axis)
     with open_renderer(RenderConfig(size=EPISODE, robot=True), (OVERVIEW,)) as renderer:
         images = [draw_step(background, renderer.render(q)[0], points, t) for t, q in enumerate(states)]
     durations = [round(1000 / FPS)] * (len(images) - 1) + [HOLD_MS]

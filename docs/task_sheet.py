@@ -1,6 +1,8 @@
 """Makes the README's picture of the six tasks: each before and after, as its scores see it; run by `make hero`.
 
-python docs/task_sheet.py [docs/images/tasks.webp]
+By hand::
+
+    python docs/task_sheet.py [docs/images/tasks.webp]
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
 
     from zest_rl.analysis.reward_figures import FALLEN, VIEW_CANNOT_TELL, ends_lower
     from zest_rl.data.reader import open_dataset
+    from zest_rl.metrics.reward_quality import share_fallen
     from zest_rl.rewards.preview import preview
     from zest_rl.rewards.relabel import relabel
     from zest_rl.sources import KitchenStates
@@ -45,7 +46,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         ui.say(f"{relabeled.dataset_id} is there already, nothing to do")
     with open_dataset(relabeled.dataset_id) as ds:
         returns = np.array([rewards.sum() for rewards in ds.rewards()])
-        fallen = np.mean([scores[-1] < scores[0] for scores in ds.scores()])
+        fallen = share_fallen(ds.scores()).value
     if np.ptp(returns) == 0:
         ui.warn("all episodes have the same return: this goal and embedder tell nothing apart")
     if fallen >= FALLEN:
