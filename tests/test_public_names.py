@@ -129,7 +129,7 @@ def test_a_wrong_argument_is_named(call: Any, message: str) -> None:
         call()
 
 
-@pytest.mark.parametrize("verb", ["collect", "evaluate", "export", "inspect", "relabel", "report"])
+@pytest.mark.parametrize("verb", ["collect", "evaluate", "export", "inspect", "push", "relabel", "report"])
 def test_the_functions_name_all_flags_of_their_verbs(verb: str) -> None:
     import importlib
     from dataclasses import fields

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         inspect,
         load_policy,
         open_dataset,
+        push,
         relabel,
         report,
         train,
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
     from zest_rl.embedders import load_embedder
 
 __all__ = [
-    "Curve", "collect", "evaluate", "export", "inspect", "load_embedder", "load_policy", "open_dataset", "relabel",
-    "report", "score", "train",
+    "Curve", "collect", "evaluate", "export", "inspect", "load_embedder", "load_policy", "open_dataset", "push",
+    "relabel", "report", "score", "train",
 ]  # fmt: skip
 __version__ = "0.1.0"
 __path__ = [*__path__, f"{__path__[0]}/kitchen/aliases"]  # modules that datasets on disk name by an earlier name

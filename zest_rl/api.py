@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from zest_rl.data.reader import Dataset
     from zest_rl.evaluation.evaluate import Evaluation
     from zest_rl.export import Exported, Format
+    from zest_rl.export.push import Upload
     from zest_rl.kitchen.collect import Collected
     from zest_rl.rewards.relabel import Relabeled
     from zest_rl.training.loop import OnProgress
@@ -158,7 +159,7 @@ def evaluate(
     """Roll a policy out in the environment of its dataset; see `zest_rl.evaluation.evaluate.evaluate`.
 
     Args:
-        run: what `train` returned.
+        run: what `train` returned, or ``hf://OWNER/NAME``, a run on the Hugging Face Hub.
         score: record ZeST scores even if the policy does not need them.
         videos: write videos of the best, median and worst episode.
         device: where the policy runs.
@@ -173,7 +174,7 @@ def evaluate(
 
     (config,) = _configs(flags, EvaluationConfig)
     return evaluate_run(
-        Path(run),
+        run,
         config,
         score=score,
         videos=videos,
@@ -218,11 +219,41 @@ def export(dataset: AnyDataset, to: Format = "npz", output: str | Path | None = 
     return export_dataset(_id(dataset), to, None if output is None else Path(output), **flags)
 
 
+def push(
+    what: AnyDataset,
+    repo_id: str,
+    *,
+    private: bool = False,
+    goal_pictures: bool = False,
+    dry_run: bool = False,
+    on_start: Callable[[Upload], None] | None = None,
+) -> Upload:
+    """Upload a dataset or a run to the Hugging Face Hub; see `zest_rl.export.push.push`.
+
+    Args:
+        what: a dataset, or the folder that `train` returned.
+        repo_id: ``OWNER/NAME``; of a dataset, NAME is the first part of its id.
+        private: make a new repository a private one, and refuse one that is public.
+        goal_pictures: also upload the pictures of a goal that come from elsewhere: you may publish them.
+        dry_run: stop before anything is uploaded.
+        on_start: called with what will be uploaded.
+    """
+    from zest_rl.export.push import push as upload
+
+    return upload(_id(what), repo_id, private=private, goal_pictures=goal_pictures, dry_run=dry_run, on_start=on_start)
+
+
 def load_policy(run: str | Path, device: str = "cpu", *, trust: bool = False) -> Policy:
-    """Return the policy of a finished run, to act with; see `zest_rl.agents.load_policy`."""
+    """Return the policy of a finished run, to act with; see `zest_rl.agents.load_policy`.
+
+    Args:
+        run: what `train` returned, or ``hf://OWNER/NAME``, a run on the Hugging Face Hub.
+        device: where the policy runs.
+        trust: run the policy of somebody else, if it is a program, now and from now on.
+    """
     from zest_rl.agents import load_policy as load
 
-    return load(Path(run), device, trust=trust)
+    return load(run, device, trust=trust)
 
 
 def open_dataset(dataset: AnyDataset) -> AbstractContextManager[Dataset]:

@@ -12,6 +12,8 @@ from zest_rl.runtime.privacy import masked
         ("timm:resnet18@/home/me/x.pth", "timm:resnet18@…/x.pth"),
         ("command:/usr/bin/python3 /home/me/serve.py --password=a", "command:…/python3 …/serve.py --password=…"),
         ('{"model": "/home/me/x.xml"}', '{"model": "…/x.xml"}'),
+        ('{"model":"/home/my self/x.xml", "password": "a"}', '{"model": "…/x.xml", "password": "…"}'),
+        ('{"model":"x.xml"}', '{"model":"x.xml"}'),
         ("--api-key abc --n 5", "--api-key … --n 5"),
         ("WANDB_API_KEY=abc", "WANDB_API_KEY=…"),
         ("https://me:pw@host.org/x", "https://…@host.org/x"),

@@ -18,6 +18,7 @@ from zest_rl.agents.base import Agent, DataFacts, Policy
 from zest_rl.embedders import find_device
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime.artifacts import hash_bytes, read_json
+from zest_rl.runtime.hub import local_run
 from zest_rl.runtime.records import from_json, reading_record
 from zest_rl.runtime.trust import remember
 
@@ -45,7 +46,7 @@ def load_policy(run_dir: str | Path, device: str = "cpu", *, trust: bool = False
     """Return the policy of a finished run; it acts in the precision it was trained in.
 
     Args:
-        run_dir: the run's folder.
+        run_dir: the run's folder, or ``hf://OWNER/NAME`` (`zest_rl.runtime.hub.local_run`).
         device: where the policy runs: "cpu", "cuda", "cuda:1", "mps", "auto" (CUDA where there is one, else the CPU).
         trust: run a foreign policy that was not adopted on this machine, now and from now on.
 
@@ -54,7 +55,7 @@ def load_policy(run_dir: str | Path, device: str = "cpu", *, trust: bool = False
         BadInput: there is no such device, ``meta.json`` is not as this package writes it, its agent is unknown here, or
             a foreign policy is not trusted or cannot be read.
     """
-    run_dir = Path(run_dir)
+    run_dir = local_run(run_dir)
     place, path = find_device(device), run_dir / "meta.json"
     meta: dict[str, Any] = read_json(path)
     with reading_record(path):

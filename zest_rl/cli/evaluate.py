@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
@@ -20,8 +19,8 @@ if TYPE_CHECKING:
 class Config:
     """Evaluate a policy in the environment of its dataset: return (normalized if there are references), success."""
 
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """Folder that `zest train` or `zest adopt` left."""
+    run: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN")]
+    """Folder that `zest train` or `zest adopt` left, or hf://OWNER/NAME, which `zest push` uploaded."""
     n_episodes: int = 50
     """Episodes; equal seeds give equal starts to every policy."""
     seed: int = 1_000_000
@@ -52,24 +51,25 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Roll out, summarise, write videos."""
     from zest_rl.evaluation.evaluate import episode_videos, evaluate, evaluation_folder
     from zest_rl.kitchen.videos import ensure_videos
+    from zest_rl.runtime.hub import local_run
 
-    started, asked = time.monotonic(), settings(config)
+    started, asked, folder = time.monotonic(), settings(config), local_run(config.run)
     with ui.progress("episodes", config.n_episodes) as advance:
         options = {name: getattr(config, name) for name in ("score", "device", "n_workers", "trust")}
-        result = evaluate(config.run, asked, **options, on_progress=advance)
+        result = evaluate(folder, asked, **options, on_progress=advance)
     seconds, summary = round(time.monotonic() - started, 2), result.summary()
     if clipped := summary.get("clipped_actions"):
         ui.warn(f"{clipped:.1%} of the actions left [-1, 1] and were clipped, as the environment does")
     videos = episode_videos(result) if config.videos else {}
     ensure_videos(videos.values(), n_workers=config.n_workers)
-    folder = evaluation_folder(config.run, asked)
+    results = evaluation_folder(folder, asked)
     return {
-        "run": str(config.run),
+        "run": str(folder),
         **summary,
-        "result": str(folder / "result.json"),
-        "videos": {name: str(folder / video.path.name) for name, video in videos.items()},
+        "result": str(results / "result.json"),
+        "videos": {name: str(results / video.path.name) for name, video in videos.items()},
         "seconds": seconds,
-        "next": f"zest report {shlex.quote(str(config.run))}",
+        "next": f"zest report {shlex.quote(str(folder))}",
     }
 
 

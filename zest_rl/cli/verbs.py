@@ -18,6 +18,7 @@ VERBS = {
     "evaluate": "a policy → returns and success in MuJoCo, with videos",
     "reproduce": "a recipe → a whole table or figure, cell by cell; rerun it to resume",
     "report": "results → one HTML file",
+    "push": "a dataset or a policy → the Hugging Face Hub",
 }
 
 
@@ -71,6 +72,10 @@ USAGES = {
     ),
     "reproduce": Usage(("output", "n_workers"), ("demo", "eval/table1_quick.toml --output runs/mine")),
     "report": Usage(("output", "title"), ("runs/bc-seed0 runs/bc-seed1 runs/dt-seed0 runs/dt-seed1",)),
+    "push": Usage(
+        ("private", "dry_run"),
+        ("zest/kitchen-micro-noisy-zest-0a1b2c3d-v0 me/zest --dry-run", "runs/dt-seed0 me/micro-dt --private"),
+    ),
 }
 """By the verb, with its sub-verb where their flags differ."""
 

@@ -17,6 +17,8 @@ DATASET_ID = re.compile(r"(?:[A-Za-z0-9][\w.-]+/)*[A-Za-z0-9][\w.-]*-v\d+")
 DATA_FILE, METADATA_FILE, MANIFEST_FILE = "data/main_data.hdf5", "data/metadata.json", "zest_manifest.json"
 CARD_FILE = "README.md"
 """For readers, who may add to it: not in the manifest."""
+GOAL_FOLDER = "zest_goal"
+"""Thumbnails of the goal's pictures, in a relabeled dataset."""
 
 
 def datasets_root() -> Path:
@@ -78,7 +80,8 @@ def verified_metadata(dataset_id: str) -> dict[str, Any]:
     if not exists(dataset_id):
         raise BadInput(
             f"there is no dataset {dataset_id!r} under the Minari root; {nearest(dataset_id, list_datasets())}. "
-            f"Make one with `zest collect`, fetch a public one with `minari download {dataset_id}`, or set "
+            f"Make one with `zest collect`, fetch a public one with `minari download {dataset_id}` (after "
+            "`export MINARI_REMOTE=hf://OWNER` one of OWNER, as `zest push` uploads it), or set "
             "MINARI_DATASETS_PATH to the folder that holds it"
         )
     files = _files(folder)

@@ -28,6 +28,7 @@ from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return, repres
 from zest_rl.rewards.scorer import SCORER_FILE, check_scorer
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.hub import local_run
 from zest_rl.runtime.parallel import cached_jobs, chunks, one_thread, read_parts
 from zest_rl.runtime.records import from_json, reading_record
 from zest_rl.types import EpisodeResult
@@ -202,14 +203,13 @@ def evaluate(
     """Evaluate the final policy of a run; finished parts are kept, so an interrupted evaluation goes on from there.
 
     Args:
-        run: folder of `zest_rl.training.runs.train` or `zest_rl.training.adoption.adopt`.
+        run: folder that `zest train` or `zest adopt` left, or ``hf://OWNER/NAME`` (`zest_rl.runtime.hub.local_run`).
         config: environment, seeds and return-to-go; default `EvaluationConfig()`.
         score: record ZeST scores even if the policy does not need them.
         videos: also write `episode_videos`; a `Notice` tells where they cannot be drawn.
         device: where the policy runs.
         n_workers: number of processes, default one per core.
-        trust: run the policy of somebody else, and load the embedder that the run names, now and from now on
-            (`zest_rl.runtime.trust`).
+        trust: run the policy, and load the embedder, that a run of somebody else names (`zest_rl.runtime.trust`).
         on_progress: called with the number of episodes finished since the last call.
 
     Raises:
@@ -218,7 +218,7 @@ def evaluate(
         ZestError: a part of the run is damaged, or its environment cannot be made here.
     """
     config = EvaluationConfig() if config is None else config
-    run = Path(run)
+    run = local_run(run)
     check_finished(run)
     run = run.resolve()
     policy = load_policy(run, device=device, trust=trust)

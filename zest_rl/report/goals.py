@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from zest_rl.analysis.reward_figures import true_returns
+from zest_rl.data.folders import GOAL_FOLDER
 from zest_rl.data.images import list_images, read_image
 from zest_rl.data.provenance import RelabelRecord
 from zest_rl.data.reader import Dataset
@@ -17,7 +18,6 @@ from zest_rl.metrics.reward_quality import returns_of
 from zest_rl.metrics.statistics import MIN_EPISODES_TO_RANK, Estimate, Values, spearman
 from zest_rl.report.content import GoalPanel, Scatter
 from zest_rl.rewards.goals import TASK_TEXT, TEXT, read_goal, read_text
-from zest_rl.rewards.relabel import GOAL_FOLDER
 
 
 def goal_scatter(name: str, ds: Dataset) -> Scatter:
@@ -35,7 +35,7 @@ def return_scatter(name: str, returns: Values, truth: Values, rho: Estimate) -> 
 
 
 def goal_panel(name: str, record: RelabelRecord, folder: Path, scatter: Scatter | None = None) -> GoalPanel:
-    """Return the goal of a relabeled dataset, as pictures or sentences.
+    """Return the goal of a relabeled dataset, as pictures or sentences; pictures need not have come with it.
 
     Args:
         name: of the goal in the report.
@@ -44,7 +44,7 @@ def goal_panel(name: str, record: RelabelRecord, folder: Path, scatter: Scatter 
         scatter: how the goal ranks episodes, if known.
 
     Raises:
-        BadInput: the goal is pictures, and they are not in the folder.
+        BadInput: the goals that were kept are none of its goals.
     """
     ranking = (None, 0) if scatter is None else (scatter.spearman, len(scatter.x))
     if (folder / GOAL_FOLDER).is_dir():
@@ -54,7 +54,8 @@ def goal_panel(name: str, record: RelabelRecord, folder: Path, scatter: Scatter 
         return GoalPanel(name, start, goal, *ranking)
     views, spec = record.scorer.views, record.scorer.goal
     if not (spec == TASK_TEXT or spec.startswith(TEXT)):  # a dataset names no other folders to read
-        raise BadInput(f"{folder} lacks the pictures of its goal, {GOAL_FOLDER}/; relabel it again")
+        absent = ("pictures that did not come with the dataset",)
+        return GoalPanel(name, absent, absent, *ranking)
     sentences = read_text(spec) if views is None else read_goal(spec, get_task(views["task"]))
     n_goals = len(sentences.goals)
     kept = range(n_goals) if record.kept_goals is None else record.kept_goals

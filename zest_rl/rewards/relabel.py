@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from zest_rl.data import reader
-from zest_rl.data.folders import CARD_FILE
+from zest_rl.data.folders import CARD_FILE, GOAL_FOLDER
 from zest_rl.data.provenance import RelabelRecord
 from zest_rl.data.writer import write_scored
 from zest_rl.embedders import DEFAULT_EMBEDDER, Precision
@@ -35,7 +35,6 @@ from zest_rl.sources.scenes import SceneStates
 from zest_rl.types import FloatArray
 
 Reward = Literal["level", "difference"]
-GOAL_FOLDER = "zest_goal"
 MAX_THUMBNAILS, THUMBNAIL = 8, 160
 """Number of start pictures and of goal pictures kept for reports, and their longer side in pixels."""
 

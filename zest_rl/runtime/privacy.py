@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -26,7 +27,7 @@ def masked(value: Any) -> Any:
     follows ``--password`` is hidden, and in a mapping the value of ``password``. Keys that become equal are numbered.
     """
     if isinstance(value, str):
-        return _mask(value)
+        return _mask_json(value) if value.startswith("{") else _mask(value)
     if isinstance(value, Mapping):
         shown: dict[Any, Any] = {}
         for key, item in value.items():
@@ -39,6 +40,16 @@ def masked(value: Any) -> Any:
         flags = [isinstance(item, str) and _FLAG.fullmatch(item) is not None for item in value]
         return [HIDDEN if hide else masked(item) for hide, item in zip([False, *flags], value, strict=False)]
     return value
+
+
+def _mask_json(text: str) -> str:
+    """Mask what is in an object that a string holds, such as an EnvSpec; leave one without secrets as it is."""
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        return _mask(text)
+    shown = masked(value)
+    return text if shown == value else json.dumps(shown, ensure_ascii=False)
 
 
 def _mask(text: str) -> str:
