@@ -223,6 +223,8 @@ def test_what_cannot_be_pushed_or_fetched_says_why_and_nothing_is_left_half_ther
     assert f"{name} has other content (config.json)" in refused("push", run, name)
     assert "is no run: it holds no meta.json" in refused("evaluate", f"hf://{name}")
     (run / "model.safetensors").write_bytes(b"x")
+    artifacts.write_json(trained / "adopted" / "meta.json", {"agent": "foreign"})
+    assert "an adopted policy" in refused("push", trained / "adopted", name)
     assert "is damaged" in refused("push", run, name, code=1)
 
 

@@ -34,7 +34,7 @@ from zest_rl.errors import BadInput, Notice, ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.cache import cache_folder
 from zest_rl.runtime.files import check_file
-from zest_rl.runtime.hub import RUN_FILES, check_repo_id, hub_errors
+from zest_rl.runtime.hub import RUN_FILES, SCORER_FILE, check_repo_id, hub_errors
 from zest_rl.runtime.privacy import masked
 from zest_rl.runtime.records import reading_record
 
@@ -119,18 +119,19 @@ def _of_run(run: Path, repo_id: str) -> Upload:
     with reading_record(run / "meta.json"):
         sha256 = meta.get("model_sha256")
     if sha256 is None:
-        raise BadInput(f"{run} holds a policy that was adopted, a program; push takes those that `zest train` made")
+        raise BadInput(f"{run} holds an adopted policy, a program; push takes those that `zest train` made")
     check_file(path)
     if artifacts.hash_file(path) != sha256:
         raise ZestError(
             f"{path} is damaged: meta.json has another sha256; restore it, or train again into a new folder"
         )
-    files: dict[str, Path | bytes] = {name: run / name for name in RUN_FILES if (run / name).exists()}
-    hidden = _hide(files)
+    paths = {name: run / name for name in RUN_FILES if (run / name).exists()}
+    hidden = _hide(paths)
+    files: dict[str, Path | bytes] = {**paths, **hidden}
     if CARD_FILE in files:
         card = (run / CARD_FILE).read_text(encoding="utf-8")
         files[CARD_FILE] = (card if card.startswith("---") else RUN_TAGS + card).encode()
-    return Upload(repo_id, "model", None, files, hidden)
+    return Upload(repo_id, "model", None, files, tuple(hidden))
 
 
 def _of_dataset(dataset_id: str, repo_id: str, goal_pictures: bool) -> Upload:
@@ -151,18 +152,18 @@ def _of_dataset(dataset_id: str, repo_id: str, goal_pictures: bool) -> Upload:
     digests = artifacts.read_json(folder / MANIFEST_FILE) if has_manifest else {}
     left_out = _goal_pictures_to_leave_out(record, digests, goal_pictures)
     listed = [name for name in digests or (DATA_FILE, METADATA_FILE) if name not in left_out]
-    files: dict[str, Path | bytes] = {name: folder / name for name in listed}
-    hidden = _hide(files)
+    paths = {name: folder / name for name in listed}
+    hidden = _hide(paths)
+    files: dict[str, Path | bytes] = {**paths, **hidden}
     if has_manifest:
-        kept = {
-            name: artifacts.hash_bytes(file) if isinstance(file, bytes) else digests[name]
-            for name, file in files.items()
-        }
+        hashes = {name: artifacts.hash_bytes(content) for name, content in hidden.items()}
+        kept = {name: hashes.get(name, digests[name]) for name in listed}
         files[MANIFEST_FILE] = folder / MANIFEST_FILE if kept == digests else _as_json(kept)
     if (folder / CARD_FILE).exists():
         files[CARD_FILE] = folder / CARD_FILE
     inside = f"{rest}/" if rest else ""
-    return Upload(repo_id, "dataset", dataset_id, {inside + name: file for name, file in files.items()}, hidden)
+    placed = {inside + name: file for name, file in files.items()}
+    return Upload(repo_id, "dataset", dataset_id, placed, tuple(hidden))
 
 
 def _goal_pictures_to_leave_out(record: DatasetRecord, names: Iterable[str], asked: bool) -> list[str]:
@@ -188,22 +189,17 @@ def _goal_pictures_to_leave_out(record: DatasetRecord, names: Iterable[str], ask
     return pictures
 
 
-def _hide(files: dict[str, Path | bytes]) -> tuple[str, ...]:
-    """Replace the files that name folders of this machine or hold secrets; return their names."""
-    hidden = []
-    for name, path in files.items():
-        if not isinstance(path, Path):
-            continue
-        content: bytes | None = None
-        if name in (METADATA_FILE, "meta.json"):
-            value = artifacts.read_json(path)
-            content = None if masked(value) == value else _as_json(masked(value))
-        elif name == "zest_scorer.safetensors":
-            content = _hidden_header(path)
-        if content is not None:
-            files[name] = content
-            hidden.append(name)
-    return tuple(hidden)
+def _hide(paths: Mapping[str, Path]) -> dict[str, bytes]:
+    """Return, of the files that name folders of this machine or hold secrets, the content without these."""
+    hidden = {}
+    for name in (METADATA_FILE, "meta.json"):
+        if name in paths:
+            value = artifacts.read_json(paths[name])
+            if masked(value) != value:
+                hidden[name] = _as_json(masked(value))
+    if SCORER_FILE in paths and (content := _hidden_header(paths[SCORER_FILE])) is not None:
+        hidden[SCORER_FILE] = content
+    return hidden
 
 
 def _hidden_header(path: Path) -> bytes | None:
@@ -280,10 +276,11 @@ def _check_content(upload: Upload, there: Mapping[str, RepoFile]) -> None:
 
 
 def _is_equal(file: Path | bytes, there: RepoFile) -> bool:
-    """Compare by size and hash: sha256 of large files, git's sha1 of others."""
-    content = file if isinstance(file, bytes) else file.read_bytes()
+    """Compare by hash: sha256 of large files, git's sha1 of others."""
     if there.lfs is not None:
-        return there.lfs.sha256 == artifacts.hash_bytes(content)
+        sha256 = artifacts.hash_bytes(file) if isinstance(file, bytes) else artifacts.hash_file(file)
+        return there.lfs.sha256 == sha256
+    content = file if isinstance(file, bytes) else file.read_bytes()
     return there.blob_id == hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
 
 

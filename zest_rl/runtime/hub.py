@@ -15,7 +15,8 @@ from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime.cache import cache_folder
 
 SCHEME = "hf://"
-RUN_FILES = ("meta.json", "model.safetensors", "zest_scorer.safetensors", "README.md")
+SCORER_FILE = "zest_scorer.safetensors"
+RUN_FILES = ("meta.json", "model.safetensors", SCORER_FILE, "README.md")
 """What a run consists of on the hub; all that is fetched of one. Nothing in them runs."""
 _ADVICE = {
     401: "the token is missing or not valid; run `hf auth login`, or set HF_TOKEN",
@@ -71,7 +72,8 @@ def hub_errors(doing: str) -> Iterator[None]:
     """
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
 
-    of_http = cast("tuple[type[Exception], ...]", HfHubHTTPError.__bases__)  # each major version has another library
+    bases = cast("tuple[type[Exception], ...]", HfHubHTTPError.__bases__)
+    of_http = tuple(base for base in bases if base is not OSError)  # each major version has another HTTP library
     failures: tuple[type[Exception], ...] = (OSError, RuntimeError, ValueError, *of_http)
     try:
         yield
