@@ -85,7 +85,7 @@ def test_without_ground_truth_the_rest_is_still_measured(scored: str) -> None:
     assert "Ranking" not in page
 
 
-FINE = Estimate(0.0, 0.0, 0.0)
+FINE, UNDEFINED = Estimate(0.0, 0.0, 0.0), Estimate(np.nan, np.nan, np.nan)
 SCORES = [np.array([0.0, 0.5, 1.0], np.float32), np.array([0.0, 0.1, 0.2], np.float32)]
 
 
@@ -112,7 +112,7 @@ def test_each_degenerate_reward_has_its_warning(figure: str, value: float, expec
     [
         (Estimate(0.2, -0.1, 0.5), "ρ = 0.20, 95 % interval -0.10 to 0.50."),
         (Estimate(-0.6, -0.8, -0.4), "The higher the return, the worse the episode."),
-        (Estimate(np.nan, np.nan, np.nan), "do not rank the episodes"),
+        (UNDEFINED, "All true returns are equal, so they rank nothing"),
     ],
 )
 def test_returns_that_do_not_rank_the_episodes_are_warned_of(rho: Estimate, expected: str) -> None:
@@ -131,6 +131,7 @@ def test_constant_scores_and_constant_returns_are_warned_of() -> None:
     assert reward_warnings([np.float32(0.999) + np.float32(8e-4) * score for score in SCORES], figures) == []
     alike = [np.array([0.0, 1.0], np.float32), np.array([1.0, 0.0], np.float32)]
     assert "same return" in reward_warnings(alike, figures)[0]
+    assert len(reward_warnings(alike, {**figures, "spearman": UNDEFINED})) == 1, "nothing more is said of them"
 
 
 def test_returns_that_follow_the_length_of_the_episode_are_warned_of() -> None:

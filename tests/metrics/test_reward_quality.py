@@ -168,9 +168,12 @@ def test_an_undefined_figure_is_nan_and_not_a_number_that_looks_good() -> None:
         reward_quality.kendall(reward_quality.returns_of(constant), reward_quality.returns_of(truth)),
         reward_quality.pairwise_accuracy(reward_quality.returns_of(truth), np.ones(N)),
         reward_quality.average_precision(reward_quality.returns_of(truth), np.zeros(N, bool)),
+        reward_quality.value_order([np.zeros(1, np.float32)] * N),
+        reward_quality.linear_trend_r2([RISING[:2]] * N),
     ):
         assert math.isnan(estimate.value)
         assert math.isnan(estimate.low)
+    assert reward_quality.value_order([RISING, np.zeros(1, np.float32)]).value == 1, "one step has no order"
 
 
 def test_every_interval_holds_its_value() -> None:

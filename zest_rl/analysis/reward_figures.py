@@ -16,7 +16,7 @@ CLOCK, STRAIGHT, SATURATED, STILL, FALLEN, CONTRADICTORY, LENGTH = 0.95, 0.9, 0.
 """Shares from which on a warning is given; `LENGTH`: rank correlation of returns with the episodes' lengths."""
 VIEW_CANNOT_TELL = (
     "From the first to the last frames this view changes as much as the goal does, but in other directions: one view "
-    "that shows the robot cannot tell; hide the robot (recorded states, or --masks), or add views."
+    "that shows the robot cannot tell; hide the robot (recorded states, or `--masks`), or add views."
 )
 """The warning of `zest_rl.rewards.scorer.Scorer.view_cannot_tell`."""
 FLAT = 1e-5
@@ -33,6 +33,12 @@ class Figure:
     """On pages and in text."""
     meaning: str
     """One sentence."""
+    undefined: str = ""
+    """Why there may be no such number."""
+
+    def sentence(self, *, is_defined: bool = True) -> str:
+        """Return its meaning and, where it has no value, why."""
+        return self.meaning if is_defined else f"{self.meaning} Undefined: {self.undefined}."
 
 
 FIGURES = (
@@ -40,36 +46,57 @@ FIGURES = (
         "spearman",
         "Rank correlation with the true returns",
         "Spearman's ρ: 1 orders the episodes as the ground truth does, 0 at random, -1 the wrong way round.",
+        "all returns, or all true ones, are equal",
     ),
-    Figure("kendall", "Kendall's τ-b with the true returns", "The same, counted by pairs of episodes."),
+    Figure(
+        "kendall",
+        "Kendall's τ-b with the true returns",
+        "The same, counted by pairs of episodes.",
+        "all returns, or all true ones, are equal",
+    ),
     Figure(
         "pairwise",
         "Pairs of episodes in the right order",
         "Share of pairs in which the better episode has the higher return; .5 is chance.",
+        "all true returns are equal",
     ),
     Figure(
         "auprc",
         "Average precision for success",
         "AUPRC: how well the return separates successes; chance is their share, which is the next line.",
+        "no episode succeeds",
     ),
     Figure("successes", "Successful episodes", "Their share in the dataset."),
     Figure(
         "epic",
         "EPIC distance to the true reward",
         "Compared step by step: 0 is equal up to scale and offset, .71 unrelated.",
+        "one of the two rewards never changes",
     ),
     Figure(
         "value_order",
         "Rank correlation with time",
         "Value-order correlation of score and time in an episode: 1 rises at every step, below 0 it falls.",
+        "no episode has two steps",
     ),
     Figure(
         "told_by_step",
         "Variance explained by the step number",
         "1 is a clock: the same score at the same step, whatever the robot does.",
+        "all frames score the same",
     ),
-    Figure("straight_in_time", "R² of a linear trend", "Of score over time in an episode; 1 is proportional to time."),
-    Figure("saturated", "Rewards at an end of their range", "Share close to the lowest or the highest."),
+    Figure(
+        "straight_in_time",
+        "R² of a linear trend",
+        "Of score over time in an episode; 1 is proportional to time.",
+        "no episode has three steps",
+    ),
+    Figure(
+        "saturated",
+        "Rewards at an end of their range",
+        "Share close to the lowest or the highest.",
+        "all frames score the same",
+    ),
     Figure("still", "Unchanged frames", "Share of frames that equal the first one: nothing is seen to move."),
     Figure("fallen", "Episodes that end lower", "Share whose last frame scores lower than their first."),
     Figure(
@@ -147,8 +174,8 @@ def ends_lower(share: float) -> str:
     """Return the warning of `FALLEN`."""
     return (
         f"{share:.0%} of the episodes end with a lower score than they began with: the goal is not what they lead to, "
-        "or some of its pictures mislead. Of many pictures, --goal-share 0.2 keeps those that the episodes end nearest "
-        "to."
+        "or some of its pictures mislead. Of many pictures, `--goal-share 0.2` keeps those that the episodes end "
+        "nearest to."
     )
 
 
@@ -170,7 +197,7 @@ def reward_warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimat
         sentences.append(
             f"Episodes are {lengths.min()} to {lengths.max()} steps long, and their returns follow the length (ρ = "
             f"{by_length:.2f}): a sum of levels rewards a long episode whatever it shows. Let all last equally long, "
-            "or reward the change of the score (--reward difference)."
+            "or reward the change of the score (`--reward difference`)."
         )
     if "contradictory" in figures and figures["contradictory"].value >= CONTRADICTORY:
         sentences.append(
@@ -193,7 +220,12 @@ def reward_warnings(rewards: Sequence[FloatArray], figures: Mapping[str, Estimat
     if figures["fallen"].value >= FALLEN:
         sentences.append(ends_lower(figures["fallen"].value))
     rho = figures.get("spearman")
-    if rho is not None and not rho.low > 0:  # also when it is NaN
+    if rho is not None and np.isnan(rho.value):
+        if np.ptp(returns) > 0:
+            sentences.append(
+                "All true returns are equal, so they rank nothing: the verdict goes by the rules without ground truth."
+            )
+    elif rho is not None and not rho.low > 0:
         against = " The higher the return, the worse the episode." if rho.high < 0 else ""
         sentences.append(
             f"The returns do not rank the episodes as the true ones do: ρ = {rho.value:.2f}, "

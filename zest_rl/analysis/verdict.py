@@ -28,8 +28,9 @@ MIN_EPISODES = 5
 """Chance orders four episodes rightly once in 24 times."""
 RANKS = 0.5
 """Rank correlation with the true returns from which on a reward is good."""
-RISES, FALLS = 0.2, 0.25
-"""Rank correlation with time from which on scores rise; share of episodes that end lower from which on they do not."""
+RISES, FALLS = 0.25, 0.25
+"""Scores rise where the whole interval of their rank correlation with time lies above the first: whatever drifts away
+from the start correlates a little. They do not where a larger share of the episodes than the second ends lower."""
 _LABELS = {figure.key: figure.label for figure in FIGURES}
 
 
@@ -100,7 +101,7 @@ def judge(
         return decided("do not", "these are the scores of other episodes", "contradictory", "spearman")
     direction = ("value_order", "fallen")
     rho = figures.get("spearman")
-    if rho is not None and np.isnan(rho.value):  # all true returns are equal, and say nothing
+    if rho is not None and np.isnan(rho.value):  # all true returns are equal and rank nothing
         rho = None
     if n < MIN_EPISODES:
         keys = direction if rho is None else ("spearman", "pairwise")
@@ -136,6 +137,6 @@ def _by_truth(rho: Estimate, n: int) -> tuple[Advice, str]:
 def _by_direction(order: Estimate, fallen: Estimate, n: int) -> tuple[Advice, str]:
     if order.high <= 0 or fallen.low > FALLS:
         return "do not", f"in the {n} episodes the score does not rise, so the goal is not what they lead to"
-    if order.low > 0 and order.value >= RISES and fallen.value <= FALLS:
-        return "train on it", f"in the {n} episodes the score rises; no ground truth is there to say more"
+    if order.low >= RISES and fallen.value <= FALLS:
+        return "train on it", f"in the {n} episodes the score rises; no ground truth ranks them"
     return "too few episodes to tell", f"{n} leave open whether the score rises in an episode"

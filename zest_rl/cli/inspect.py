@@ -60,7 +60,9 @@ def summary(result: Mapping[str, Any]) -> str:
         lines += ["", f"{dataset}: {judged['label']}"]
         lines += [f"  warning: {sentence}" for sentence in result["warnings"][dataset]]
         figures = judged["figures"]
-        lines += [f"{_cell(figures[f.key])}  {f.label}. {f.meaning}" for f in FIGURES if f.key in figures]
+        for figure in (figure for figure in FIGURES if figure.key in figures):
+            value = figures[figure.key]
+            lines.append(f"{_cell(value)}  {figure.label}. {figure.sentence(is_defined=value is not None)}")
     return "\n".join([*lines, "", f"report: {result['report']}"])
 
 

@@ -31,8 +31,10 @@ def _check_pairs(what: str, scores: Sequence[NDArray[np.generic]], others: Seque
 
 
 def _mean_over_episodes(values: Sequence[float]) -> Estimate:
+    """Average over the episodes of which a figure is known; NaN if it is of none."""
     array = np.array(values)
-    return over_episodes(lambda i: float(array[i].mean()), len(array))
+    known = array[~np.isnan(array)]
+    return over_episodes(lambda i: float(known[i].mean()) if len(known) else float("nan"), len(known))
 
 
 def _mean_over_frames(shares: Values, scores: Sequence[NDArray[np.generic]]) -> Estimate:
@@ -50,14 +52,17 @@ def value_order(scores: Sequence[FloatArray]) -> Estimate:
     """Value-order correlation: Spearman's ρ of score and time in an episode, averaged over episodes. No ground truth.
 
     1 is a score that rises at every step (Ma et al. 2024, https://arxiv.org/abs/2411.04549). Episodes whose scores are
-    constant have no order and count as 0.
+    constant have no order and count as 0. Those of one step are left out; NaN if there are no others.
     """
     from scipy import stats
 
+    def order(score: FloatArray) -> float:
+        if len(score) < 2:
+            return float("nan")
+        return 0.0 if np.ptp(score) == 0 else float(stats.spearmanr(score, np.arange(len(score))).statistic)
+
     _check_pairs("scores", scores, scores)
-    return _mean_over_episodes(
-        [0.0 if np.ptp(score) == 0 else stats.spearmanr(score, np.arange(len(score))).statistic for score in scores]
-    )
+    return _mean_over_episodes([order(score) for score in scores])
 
 
 def share_explained_by_step(scores: Sequence[FloatArray]) -> Estimate:
@@ -93,12 +98,17 @@ def share_explained_by_step(scores: Sequence[FloatArray]) -> Estimate:
 def linear_trend_r2(scores: Sequence[FloatArray]) -> Estimate:
     """R² of a linear trend of score over time (Pearson's ρ²), averaged over episodes. No ground truth.
 
-    Episodes whose scores are constant, or that have one step, count as 0.
+    Episodes whose scores are constant count as 0. Those of one or two steps, through which every line goes, are left
+    out; NaN if there are no others.
     """
+
+    def r2(score: FloatArray) -> float:
+        if len(score) < 3:
+            return float("nan")
+        return 0.0 if np.ptp(score) == 0 else float(np.corrcoef(score, np.arange(len(score)))[0, 1] ** 2)
+
     _check_pairs("scores", scores, scores)
-    return _mean_over_episodes(
-        [0.0 if np.ptp(score) == 0 else np.corrcoef(score, np.arange(len(score)))[0, 1] ** 2 for score in scores]
-    )
+    return _mean_over_episodes([r2(score) for score in scores])
 
 
 def share_saturated(scores: Sequence[FloatArray]) -> Estimate:
