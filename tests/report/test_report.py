@@ -24,7 +24,6 @@ from markupsafe import escape
 from zest_rl.errors import BadInput
 from zest_rl.report.charts import axis_over, correlation_gauge, interval_bar, results_axis
 from zest_rl.report.content import (
-    Curve,
     EpisodePanel,
     GoalPanel,
     MethodRow,
@@ -32,6 +31,7 @@ from zest_rl.report.content import (
     QualityTable,
     Scatter,
     ScoreMatrix,
+    Series,
     Strip,
     TaskTable,
 )
@@ -124,15 +124,15 @@ def report(video: Path) -> Report:
             GOALS(goals),
             RANKING((Scatter("delta cos", returns, returns / 2, 0.83, (0.71, 0.9)),)),
             FRAMES((Strip("the best", (image, image), (0, 30), np.array([0.0, 1.2], np.float32)),)),
-            VIEWS((Curve("all views", "score", steps, steps), Curve("view 1", "score", steps, 2 * steps))),
+            VIEWS((Series("all views", "score", steps, steps), Series("view 1", "score", steps, 2 * steps))),
             PIXELS((pixels,)),
-            SCORES_OVER_TIME((Curve("successes", "mean reward", steps, steps),)),
-            SUB_GOALS((Curve("open", "similarity", steps, steps),)),
+            SCORES_OVER_TIME((Series("successes", "mean reward", steps, steps),)),
+            SUB_GOALS((Series("open", "similarity", steps, steps),)),
             EPISODES((episode, dataclasses.replace(episode, title="not scored", scores=None, success=False))),
             LEARNING_CURVES(
                 (
-                    Curve("BC", "loss", steps, 1 / (1 + steps)),
-                    Curve("DT", "loss", steps, steps, (steps - 1, steps + 1)),
+                    Series("BC", "loss", steps, 1 / (1 + steps)),
+                    Series("DT", "loss", steps, steps, (steps - 1, steps + 1)),
                 )
             ),
             DETAILS((("config", {"lr": 1e-4, "folder": Path("runs/a")}),)),
@@ -274,7 +274,7 @@ def test_figures_that_are_not_finite_are_shown_as_a_dash(report: Report) -> None
         GOALS((dataclasses.replace(report.items(GOALS)[0], spearman=nan),)),
         EPISODES((dataclasses.replace(report.items(EPISODES)[0], scores=scores, value=nan),)),
         RANKING((Scatter("s", np.array([1, 2, inf], np.float32), np.array([1, nan, 2], np.float32), nan, (nan, nan)),)),
-        LEARNING_CURVES((Curve("BC", "loss", np.zeros(2, np.float32), np.full(2, nan, np.float32)),)),
+        LEARNING_CURVES((Series("BC", "loss", np.zeros(2, np.float32), np.full(2, nan, np.float32)),)),
         DETAILS((("config", {"target": nan, "limits": [inf, np.float32("nan")], "array": np.array([nan])}),)),
         REWARD_QUALITY((QualityTable(("d",), (QualityRow("q", "m", ((nan, nan, inf),)),)),)),
         TASKS_AGAINST_GOALS((ScoreMatrix(("d",), ("d",), *np.full((3, 1, 1), nan, np.float32)),)),
@@ -334,7 +334,7 @@ def test_parts_that_do_not_fit_together_are_refused(report: Report) -> None:
     with pytest.raises(BadInput, match=r"2 sources and 1 goals must have shape \(2, 1\), got \(1, 2\)"):
         ScoreMatrix(("door", "knob"), ("delta",), *np.zeros((3, 1, 2), np.float32))
     with pytest.raises(BadInput, match="got steps 3, values 3, low 4, high 4"):
-        Curve("BC", "loss", three, three, (four, four))
+        Series("BC", "loss", three, three, (four, four))
     with pytest.raises(BadInput, match=r"unknown kind 'metod'; did you mean 'method'"):
         MethodRow("BC", 1, 0, 2, 1, 0, 1, 1, kind="metod")  # type: ignore[arg-type]
     with pytest.raises(BadInput, match=r"shape \(H, W, 3\) and dtype uint8, got shape \(4, 4\) and dtype float64"):

@@ -45,6 +45,40 @@ def test_folders_of_videos_and_of_pictures_are_views(
         np.testing.assert_allclose(scores, expected_scores([episode.frames, list(film)], goal), atol=1e-4)
 
 
+@pytest.mark.parametrize("masks", [False, True])
+def test_inspect_shows_what_lies_in_a_folder_as_long_as_it_is_what_was_scored(
+    maze: list[Episode], goal: Path, zest: Run, tmp_path: Path, *, masks: bool
+) -> None:
+    for i, episode in enumerate(maze):
+        for name in ("films", "masks"):
+            (tmp_path / name / f"episode_{i}").mkdir(parents=True)
+        for t, frame in enumerate(episode.frames):
+            Image.fromarray(frame).save(tmp_path / "films" / f"episode_{i}" / f"{t}.png")
+            Image.new("L", frame.shape[1::-1]).save(tmp_path / "masks" / f"episode_{i}" / f"{t}.png")
+    words = ["--frames", tmp_path / "films", *(["--masks", tmp_path / "masks"] if masks else [])]
+    made = zest("relabel", write_blind(maze), "--goal", goal, *words, "--n-workers", "1")["dataset"]
+
+    def page() -> str:
+        zest("inspect", made, "--output", tmp_path / "page.html")
+        return (tmp_path / "page.html").read_text()
+
+    shown = page()
+    assert (shown.count('class="strip"'), shown.count("data:video/mp4")) == (2, 2)
+    assert "Not shown" not in shown
+    assert "All true returns are equal, so they rank nothing" in shown
+    assert "Undefined: all returns, or all true ones, are equal." in shown
+    Image.fromarray(maze[0].frames[0]).save(tmp_path / "films" / "episode_1" / "2.png")
+    changed = page()
+    assert "and the files there are not those that were scored" in changed
+    shutil.rmtree(tmp_path / "films")
+    gone = page()
+    assert "which is not there" in gone
+    for without in (changed, gone):
+        assert "<h2>Not shown</h2>" in without
+        assert 'class="strip"' not in without
+        assert str(tmp_path) not in without
+
+
 def test_one_frame_may_be_missing_at_the_end_and_no_more(
     maze: list[Episode], goal: Path, zest: Run, refusal: Callable[..., tuple[int, str]], tmp_path: Path
 ) -> None:

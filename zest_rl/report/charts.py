@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-from zest_rl.report.content import Curve, EpisodePanel, Film, MethodRow, Scatter
+from zest_rl.report.content import EpisodePanel, Film, MethodRow, Scatter, Series
 from zest_rl.types import FloatArray
 
 MISSING = "–"
@@ -244,15 +244,15 @@ def line_chart(
     return _image(f"chart {'tall' if tall else 'low'}", label, [ticks, plot], **data)
 
 
-def by_quantity(curves: Iterable[Curve]) -> dict[str, list[Curve]]:
+def by_quantity(curves: Iterable[Series]) -> dict[str, list[Series]]:
     """Return the curves of each chart, in the order of their first appearance."""
-    quantities: dict[str, list[Curve]] = {}
+    quantities: dict[str, list[Series]] = {}
     for curve in curves:
         quantities.setdefault(curve.quantity, []).append(curve)
     return quantities
 
 
-def curve_chart(quantity: str, curves: Sequence[Curve], styles: Sequence[str]) -> Markup:
+def curve_chart(quantity: str, curves: Sequence[Series], styles: Sequence[str]) -> Markup:
     """Return curves of one quantity, each with its band where it has one."""
     lines = [Line(c.steps, c.values, style, c.band) for c, style in zip(curves, styles, strict=True)]
     return line_chart(lines, f"{quantity} of {', '.join(curve.name for curve in curves)}")
@@ -265,12 +265,12 @@ def score_range(episodes: Iterable[EpisodePanel | Film]) -> tuple[float, float]:
     return float(values.min()), float(values.max())
 
 
-def score_chart(panel: EpisodePanel | Film, y_holds: tuple[float, float]) -> Markup:
-    """Return the scores of an episode, on a y axis that covers `y_holds`."""
+def score_chart(panel: EpisodePanel | Film, y_holds: tuple[float, float], *, show_x: bool = False) -> Markup:
+    """Return the scores of an episode, on a y axis that covers `y_holds`; `show_x`: with ticks below, too."""
     assert panel.scores is not None
     label = f"ZeST score over {len(panel.scores) - 1} steps of {panel.title}"
     line = Line(np.arange(len(panel.scores), dtype=np.float32), panel.scores, "score")
-    return line_chart([line], label, y_holds=y_holds, scrub=True, show_x=False)
+    return line_chart([line], label, y_holds=y_holds, scrub=True, show_x=show_x)
 
 
 def progress_chart(panel: EpisodePanel) -> Markup:

@@ -19,7 +19,7 @@ from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import Evaluation, evaluation_folder, read_evaluation
 from zest_rl.kitchen.videos import Film, ensure_video
 from zest_rl.metrics.statistics import Estimate, bootstrap, iqm, normalized_return
-from zest_rl.report.content import Curve, MethodRow, TaskTable
+from zest_rl.report.content import MethodRow, Series, TaskTable
 from zest_rl.report.episodes import paired_episodes, representative_episodes
 from zest_rl.report.goals import goal_panel, goal_scatter
 from zest_rl.report.headline import headline
@@ -116,7 +116,7 @@ def _row(groups: list[list[NDArray[np.float64]]], successes: Sequence[bool | Non
     )
 
 
-def return_curve(method: Method) -> Curve | None:
+def return_curve(method: Method) -> Series | None:
     """Return returns over gradient steps, with their range over seeds; None without evaluated snapshots."""
     if not all(map(snapshots, method.runs)):
         return None
@@ -137,7 +137,7 @@ def return_curve(method: Method) -> Curve | None:
     return _curve(method.name, quantity, steps, [[column[step] for step in steps] for column in columns])
 
 
-def learning_curve(method: Method) -> Curve | None:
+def learning_curve(method: Method) -> Series | None:
     """Return the training loss over gradient steps, with its range over seeds; None if logged less than twice."""
     columns = []
     if not all((run / "metrics.csv").exists() for run in method.runs):
@@ -158,11 +158,11 @@ def learning_curve(method: Method) -> Curve | None:
     )
 
 
-def _curve(name: str, quantity: str, steps: Sequence[float], columns: Sequence[Sequence[float]]) -> Curve:
+def _curve(name: str, quantity: str, steps: Sequence[float], columns: Sequence[Sequence[float]]) -> Series:
     """Return mean and range over seeds; `columns` has one column per seed, each as long as `steps`."""
     values = np.array(columns, dtype=np.float32)
     band = (values.min(axis=0), values.max(axis=0)) if len(values) > 1 else None
-    return Curve(name, quantity, np.array(steps, dtype=np.float32), values.mean(axis=0), band)
+    return Series(name, quantity, np.array(steps, dtype=np.float32), values.mean(axis=0), band)
 
 
 def compare_runs(runs: Sequence[Path], *, title: str, trust: bool = False) -> Report:

@@ -168,7 +168,7 @@ class Scatter:
 
 
 @dataclass(frozen=True)
-class Curve:
+class Series:
     """One line over gradient steps, or over the steps of an episode; curves of the same quantity share a chart."""
 
     name: str

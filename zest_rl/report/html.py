@@ -72,7 +72,7 @@ def render_html(report: Report) -> str:
     )
     return environment.get_template("page.html").render(
         title=report.title,
-        summary=report.summary,
+        summary=report.summary.replace(" %", "\u00a0%"),
         sections=[section for section in report.sections if section.items],
         style=style,
         script=script,

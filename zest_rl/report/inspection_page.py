@@ -16,13 +16,14 @@ from zest_rl.analysis.inspection import Inspection, labels
 from zest_rl.analysis.reward_figures import FIGURES
 from zest_rl.data.reader import dataset_path
 from zest_rl.metrics.statistics import MIN_EPISODES_TO_RANK, spearman
-from zest_rl.report.content import Curve, Film, QualityRow, QualityTable, Scatter, ScoreMatrix, Strip
+from zest_rl.report.content import Film, QualityRow, QualityTable, Scatter, ScoreMatrix, Series, Strip
 from zest_rl.report.goals import goal_panel, return_scatter
 from zest_rl.report.sections import (
     DETAILS,
     FILMS,
     FRAMES,
     GOALS,
+    NOT_SHOWN,
     PIXELS,
     RANKING,
     REWARD_QUALITY,
@@ -33,6 +34,7 @@ from zest_rl.report.sections import (
     WARNINGS,
     Report,
 )
+from zest_rl.runtime.privacy import masked
 
 
 def inspection_report(joint: JointInspection) -> Report:
@@ -61,6 +63,7 @@ def inspection_report(joint: JointInspection) -> Report:
             RANKING(scatter for scatter in scatters.values() if scatter is not None),
             FRAMES(strip for name in views for strip in _strips(name, inspections[name], views[name])),
             FILMS(film for name in views for film in _films(name, views[name])),
+            NOT_SHOWN(map(masked, joint.left_out)),
             VIEWS(curve for name in views for curve in _by_view(name, views[name]["best"])),
             PIXELS(_pixels(name, views[name]["best"]) for name in views),
             SCORES_OVER_TIME(curve for name, each in inspections.items() for curve in _over_time(name, each)),
@@ -75,7 +78,8 @@ def _quality(inspections: Mapping[str, Inspection]) -> QualityTable:
     for figure in FIGURES:
         estimates = [figures.get(figure.key) for figures in measured]
         values = tuple(None if each is None else (each.value, each.low, each.high) for each in estimates)
-        rows.append(QualityRow(figure.label, figure.meaning, values))
+        is_defined = all(figures[figure.key] is not None for figures in measured if figure.key in figures)
+        rows.append(QualityRow(figure.label, figure.sentence(is_defined=is_defined), values))
     return QualityTable(tuple(inspections), tuple(rows))
 
 
@@ -105,12 +109,12 @@ def _films(name: str, views: Mapping[str, EpisodeView]) -> list[Film]:
     return films
 
 
-def _by_view(name: str, view: EpisodeView) -> list[Curve]:
+def _by_view(name: str, view: EpisodeView) -> list[Series]:
     if not len(view.by_view):
         return []
     steps = np.arange(len(view.scores), dtype=np.float32)
     curves = {"all views": view.scores, **{f"view {i}": scores for i, scores in enumerate(view.by_view, 1)}}
-    return [Curve(label, f"{name}: score", steps, scores) for label, scores in curves.items()]
+    return [Series(label, f"{name}: score", steps, scores) for label, scores in curves.items()]
 
 
 def _pixels(name: str, view: EpisodeView) -> Scatter:
@@ -121,8 +125,8 @@ def _pixels(name: str, view: EpisodeView) -> Scatter:
     return Scatter(name, changed, scores, rho, x_name="mean pixel difference", y_name="ZeST score", point="step")
 
 
-def _over_time(name: str, inspection: Inspection) -> list[Curve]:
+def _over_time(name: str, inspection: Inspection) -> list[Series]:
     return [
-        Curve(group, f"{name}: mean reward", np.arange(1, len(mean) + 1, dtype=np.float32), mean)
+        Series(group, f"{name}: mean reward", np.arange(1, len(mean) + 1, dtype=np.float32), mean)
         for group, mean in inspection.over_time.items()
     ]

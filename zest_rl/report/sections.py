@@ -11,7 +11,6 @@ from typing import Any, Generic, TypeVar
 
 from zest_rl.analysis.verdict import Verdict
 from zest_rl.report.content import (
-    Curve,
     EpisodePanel,
     Film,
     GoalPanel,
@@ -19,6 +18,7 @@ from zest_rl.report.content import (
     QualityTable,
     Scatter,
     ScoreMatrix,
+    Series,
     Strip,
     TaskTable,
 )
@@ -111,7 +111,7 @@ FRAMES = SectionKind[Strip](
     "frames.html",
     "Frames of one episode; below, their score between the lowest (0) and the highest (1).",
 )
-VIEWS = SectionKind[Curve](
+VIEWS = SectionKind[Series](
     "Views",
     "curves.html",
     "The same episode by all views together, which is the reward, and by each view alone.",
@@ -122,12 +122,12 @@ PIXELS = SectionKind[Scatter](
     "scatters.html",
     "One dot is one step of that episode: a score worth training on is not the amount of change.",
 )
-SCORES_OVER_TIME = SectionKind[Curve](
+SCORES_OVER_TIME = SectionKind[Series](
     "Scores over time",
     "curves.html",
     "Mean score at each step: a reward worth training on parts successes from failures.",
 )
-SUB_GOALS = SectionKind[Curve](
+SUB_GOALS = SectionKind[Series](
     "Sub-goals",
     "curves.html",
     "Each frame against each sub-goal: the lines should rise one after another.",
@@ -142,7 +142,8 @@ FILMS = SectionKind[Film](
     "films.html",
     "The best and the worst episode by return. Drag in a chart, or focus it and press the arrow keys; space plays.",
 )
-LEARNING_CURVES = SectionKind[Curve](
+NOT_SHOWN = SectionKind[str]("Not shown", "sentences.html")
+LEARNING_CURVES = SectionKind[Series](
     "Learning curves",
     "curves.html",
     "Lines are means over seeds; a band, where there is one, is their spread.",

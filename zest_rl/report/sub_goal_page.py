@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from zest_rl.analysis.sub_goals import SubGoalScores, rise_in_order
-from zest_rl.report.content import Curve, Strip
+from zest_rl.report.content import Series, Strip
 from zest_rl.report.sections import DETAILS, FRAMES, SUB_GOALS, Report
 
 
@@ -33,7 +33,7 @@ def sub_goal_report(sub_goals: Sequence[SubGoalScores], details: dict[str, objec
         )
         for sub_goal in sub_goals
     )
-    curves = (Curve(sub_goal.name, "similarity to the sub-goal", steps, sub_goal.scores) for sub_goal in sub_goals)
+    curves = (Series(sub_goal.name, "similarity to the sub-goal", steps, sub_goal.scores) for sub_goal in sub_goals)
     return Report(
         "Similarity to each sub-goal",
         f"{order}: {', '.join(rises)}.",

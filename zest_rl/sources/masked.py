@@ -32,8 +32,9 @@ class MaskedFrames:
         return self.frames.views
 
     def describe(self) -> dict[str, Any]:
-        """Origin of the frames, and the folders of the masks."""
-        return {**self.frames.describe(), "masks": list(self.masks.views)}
+        """Origin of the frames, and the names and folders of the masks."""
+        masks = {"masks": list(self.masks.views), "mask_folders": self.masks.describe()["folders"]}
+        return {**self.frames.describe(), **masks}
 
     def digest(self, episode: int) -> str:
         """Hash frames and masks."""

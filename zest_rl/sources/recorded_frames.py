@@ -1,26 +1,33 @@
-"""A relabeled dataset → the frames that were scored, as far as the dataset itself holds them; for people to look at."""
+"""A relabeled dataset → the frames that were scored, if it holds them or they are where they were; to look at."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 from zest_rl.data.reader import Dataset
-from zest_rl.errors import ZestError
+from zest_rl.errors import BadInput, ZestError
+from zest_rl.runtime import artifacts
 from zest_rl.runtime.records import from_json, reading_record
 from zest_rl.simulation.framing import ObjectRing
 from zest_rl.simulation.makers import check_named
 from zest_rl.simulation.scene import SceneConfig
 from zest_rl.sources.base import EpisodeFrames
+from zest_rl.sources.masked import MaskedFrames, without_masked
 from zest_rl.sources.pictures import Pictures, picture_entries
 from zest_rl.sources.scenes import find_scene
 from zest_rl.sources.states import DEFAULT_CAMERA, check_env, find_states
+from zest_rl.sources.videos import find_videos
 
 
 def middle_view(ds: Dataset) -> EpisodeFrames:
     """Return the frames of the middle view alone of a dataset that was not relabeled from kitchen states.
 
     Raises:
-        ZestError: the frames lie outside the dataset, or its environment cannot be made here or is not trusted.
+        ZestError: the frames lie outside the dataset and are not what they were; or its environment cannot be made
+            here or is not trusted.
     """
     assert ds.record.relabel is not None
     facts = ds.record.relabel.frames or {}
@@ -29,6 +36,8 @@ def middle_view(ds: Dataset) -> EpisodeFrames:
         view = facts["views"][len(facts["views"]) // 2]
         if "masks" not in facts and kind == "pictures" and view in picture_entries(ds.file, names[0]):
             return Pictures(ds.file, names, (view,))
+        if kind == "clips" and "folders" in facts:
+            return _in_folders(ds, facts)
         if "masks" in facts or kind not in ("scene", "states"):
             raise ZestError("its frames lie outside the dataset")
         env_spec = ds.record.maker or ds.record.env_spec
@@ -42,3 +51,27 @@ def middle_view(ds: Dataset) -> EpisodeFrames:
         robot = tuple(facts["robot"])
         config = SceneConfig(robot, facts["look_at"], not robot, ring.n_views, facts["tolerance"])
         return replace(find_scene(ds.file, names, checked, config, what), ring=replace(ring, dropped=rest))
+
+
+def _in_folders(ds: Dataset, facts: Mapping[str, Any]) -> EpisodeFrames:
+    """Find the frames in the folders that were given to relabel.
+
+    A dataset of somebody else shows no more than its maker has: all files must be those that were scored.
+    """
+    assert ds.record.relabel is not None
+    folders, masks = ([Path(path) for path in facts.get(name, ())] for name in ("folders", "mask_folders"))
+    lay, what = f"its frames lay in {', '.join(folder.name for folder in folders + masks)}", f"dataset {ds.id}"
+    n_episodes, middle = len(ds.groups), len(folders) // 2
+    if not all(folder.is_dir() for folder in folders + masks):
+        raise ZestError(f"{lay}, which is not there")
+    changed = ZestError(f"{lay}, and the files there are not those that were scored")
+    try:
+        clips = find_videos(folders, n_episodes, what)
+        scored = without_masked(clips, masks, n_episodes, what) if masks else clips
+        digests = [scored.digest(episode) for episode in range(n_episodes)]
+    except BadInput as error:
+        raise changed from error
+    if artifacts.hash_json(digests) != ds.record.relabel.frames_sha256:
+        raise changed
+    seen = clips.view(middle)
+    return MaskedFrames(seen, scored.masks.view(middle)) if isinstance(scored, MaskedFrames) else seen

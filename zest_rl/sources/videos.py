@@ -33,9 +33,14 @@ class EpisodeVideos:
         return [paths[0].parent.name for paths in self.paths]
 
     def describe(self) -> dict[str, Any]:
-        """The folders, and the alignment of frames and steps."""
+        """The folders, their names, and the alignment of frames and steps."""
         alignment = "frame t is x_t; of T, x_T repeats the last"
-        return {"kind": "clips", "views": list(self.views), "alignment": alignment}
+        folders = [str(paths[0].parent.resolve()) for paths in self.paths]
+        return {"kind": "clips", "views": list(self.views), "folders": folders, "alignment": alignment}
+
+    def view(self, index: int) -> EpisodeVideos:
+        """Return one view alone."""
+        return EpisodeVideos((self.paths[index],))
 
     def digest(self, episode: int) -> str:
         """Hash the files."""
