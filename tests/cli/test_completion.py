@@ -32,22 +32,23 @@ def scripts(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("reproduce table1_q", "table1_quick"),
         ("relabel my", "my/door-v0"),
         ("adopt a.onnx --dataset my", "my/door-v0"),
-        ("relabel my/door-v0 --preview ", ""),
+        ("relabel my/door-v0 --preview ", "datasets"),
+        ("relabel my/door-v0 --frames left d", "datasets"),
         ("--completion z", "zsh"),
     ],
 )
 def test_bash_completes_verbs_flags_values_recipes_and_datasets(
     typed: str, completed: str, scripts: Path, tmp_path: Path
 ) -> None:
-    dataset = tmp_path / "my" / "door-v0" / "data"
+    dataset = tmp_path / "datasets" / "my" / "door-v0" / "data"
     dataset.mkdir(parents=True)
     (dataset / "metadata.json").touch()
-    code = 'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _zest; echo "${COMPREPLY[*]}"'
+    code = 'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _shtab_zest; echo "${COMPREPLY[*]}"'
     words = ["zest", *typed.split(" ")]
     done = subprocess.run(
         ["bash", "-c", code, "bash", str(scripts / "bash"), *words],
-        env={"PATH": "/usr/bin:/bin", "MINARI_DATASETS_PATH": str(tmp_path)},
-        capture_output=True, text=True, check=True,
+        env={"PATH": "/usr/bin:/bin", "MINARI_DATASETS_PATH": str(tmp_path / "datasets")},
+        cwd=tmp_path, capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert (done.stdout.split(), done.stderr) == (completed.split(), "")
 
