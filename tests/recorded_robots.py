@@ -18,14 +18,23 @@ SMALL: dict[str, Any] = {"n_updates": 5, "hidden_size": 16, "n_layers": 1, "devi
 
 
 def record(
-    env: str | gymnasium.Env[Any, Any], dataset_id: str, n_episodes: int = 3, n_steps: int = 10
+    env: str | gymnasium.Env[Any, Any],
+    dataset_id: str,
+    n_episodes: int = 3,
+    n_steps: int = 10,
+    pushed: str | None = None,
 ) -> list[np.ndarray]:
-    """Record episodes, reset with the seeds 0, 1, …, in which one random action is held; return their actions."""
+    """Record episodes, reset with the seeds 0, 1, …, in which one random action is held; return their actions.
+
+    `pushed` is a joint of an object, which nobody touches, that is given a push at the start of each episode.
+    """
     recorder = Recorder(gymnasium.make(env) if isinstance(env, str) else env)
     recorder.action_space.seed(0)
     taken = []
     for seed in range(n_episodes):
         recorder.reset(seed=seed)
+        if pushed is not None:
+            recorder.unwrapped.data.joint(pushed).qvel[0] = (seed + 1) / 2  # type: ignore[attr-defined]
         actions = [recorder.action_space.sample()] * n_steps
         for step, action in enumerate(actions):
             *_, terminated, truncated, _ = recorder.step(action)

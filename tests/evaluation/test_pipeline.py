@@ -15,13 +15,14 @@ from zest_rl.runtime import artifacts
 Run = Callable[..., dict[str, Any]]
 SMALL = ("--n-updates", 5, "--hidden-size", 16, "--n-layers", 1, "--device", "cpu", "--threads", 1)
 ENVIRONMENTS = {
-    "AdroitHandDoor-v1": ("--look-at", "door"),
-    "FetchPush-v4": ("--show-robot",),
+    "AdroitHandDoor-v1": (),
+    "FetchPush-v4": (),
     "FetchReach-v4": ("--show-robot", "--look-at", "robot0:gripper_link"),
     "PointMaze_UMaze-v3": ("--show-robot",),
     "Hopper-v5": ("--show-robot", "--look-at", "torso"),
 }
-"""Environment → what is to be seen of it."""
+"""Environment → what is to be seen of it: by default the object; without one, the robot that acts."""
+PUSHED = {"AdroitHandDoor-v1": "door_hinge", "FetchPush-v4": "object0:joint"}
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +35,7 @@ def _places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_an_environment_goes_from_a_recording_to_a_report(env_id: str, zest: Run, tmp_path: Path) -> None:
-    record(env_id, "some/robot-v0")
+    record(env_id, "some/robot-v0", pushed=PUSHED.get(env_id))
     scored = zest(
         "relabel", "some/robot-v0", "--goal", "episode:0", "--views", 1, "--n-workers", 1, *ENVIRONMENTS[env_id]
     )
