@@ -121,13 +121,14 @@ def trained(trained_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 @pytest.fixture(scope="module")
 def short_videos() -> Iterator[None]:
     """Write the first 2 states of a video only."""
-    from zest_rl.kitchen import videos
+    from zest_rl.kitchen.videos import KitchenOverview
+    from zest_rl.simulation import videos
 
     write_video = videos.write_video
 
     def short_video(video: videos.Video) -> Path:
-        beside = None if video.beside is None else video.beside[:2]
-        return write_video(videos.Video(video.states[:2], video.path, beside), size=64)
+        states = [{name: part[:2] for name, part in shown.items()} for shown in (video.states, video.beside) if shown]
+        return write_video(videos.Video(states[0], video.path, KitchenOverview(64), *states[1:]))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(videos, "write_video", short_video)

@@ -29,8 +29,8 @@ from zest_rl.cli import evaluate as evaluate_verb
 from zest_rl.cli.ui import SilentUi
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.evaluation.evaluate import EPISODES_PER_JOB, Evaluation, EvaluationConfig, evaluate
-from zest_rl.kitchen import videos
 from zest_rl.runtime import artifacts
+from zest_rl.simulation import videos
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit:FutureWarning")  # d3rlpy writes TorchScript
 DOCS = Path(__file__).resolve().parents[2] / "docs"

@@ -11,13 +11,8 @@ from read_dataset import read
 
 from zest_rl.data.reader import Dataset
 from zest_rl.kitchen.scene import RenderConfig, open_renderer
-from zest_rl.kitchen.videos import (
-    FPS,
-    OVERVIEW,
-    Video,
-    ensure_videos,
-    write_video,
-)
+from zest_rl.kitchen.videos import FPS, OVERVIEW, KitchenOverview
+from zest_rl.simulation.videos import Video, ensure_videos, write_video
 
 N_FRAMES = 8
 
@@ -29,7 +24,7 @@ def states(collected: str) -> np.ndarray:
 
 
 def test_a_video_is_h264_with_one_frame_per_state_and_shows_the_states(states: np.ndarray, tmp_path: Path) -> None:
-    path = write_video(Video(states, tmp_path / "videos" / "best.mp4"), size=160)
+    path = write_video(Video({"qpos": states}, tmp_path / "videos" / "best.mp4", KitchenOverview(160)))
     with imageio.get_reader(path) as reader:
         meta, frames = reader.get_meta_data(), np.stack([np.asarray(frame) for frame in reader.iter_data()])
     assert meta["codec"] == "h264"
@@ -44,7 +39,8 @@ def test_a_video_is_h264_with_one_frame_per_state_and_shows_the_states(states: n
 
 
 def test_two_episodes_are_shown_side_by_side(states: np.ndarray, tmp_path: Path) -> None:
-    path = write_video(Video(states[:3], tmp_path / "pair.mp4", beside=states[::-1][:3]), size=96)
+    first, second = ({"qpos": some} for some in (states[:3], states[::-1][:3]))
+    path = write_video(Video(first, tmp_path / "pair.mp4", KitchenOverview(96), beside=second))
     frames = np.stack([np.asarray(frame) for frame in imageio.mimread(path)]).astype(float)
     assert frames.shape == (3, 96, 192, 3)
     with open_renderer(RenderConfig(size=96, robot=True), (OVERVIEW,)) as renderer:
@@ -56,12 +52,12 @@ def test_two_episodes_are_shown_side_by_side(states: np.ndarray, tmp_path: Path)
 def test_a_video_can_be_written_over_an_old_one(states: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     path.write_bytes(b"not a video")
-    write_video(Video(states[:2], path), size=64)
+    write_video(Video({"qpos": states[:2]}, path, KitchenOverview(64)))
     assert imageio.mimread(path)[0].shape == (64, 64, 3)
 
 
 def test_videos_are_written_side_by_side_and_those_that_are_there_are_left(states: np.ndarray, tmp_path: Path) -> None:
-    videos = [Video(states[i : i + 2], tmp_path / f"{i}.mp4") for i in (0, 1, 2, 1)]
+    videos = [Video({"qpos": states[i : i + 2]}, tmp_path / f"{i}.mp4", KitchenOverview(64)) for i in (0, 1, 2, 1)]
     videos[0].path.write_bytes(b"made before")
     done: list[None] = []
     ensure_videos(videos, n_workers=2, on_done=lambda: done.append(None))

@@ -18,7 +18,6 @@ from zest_rl.data import reader
 from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import EvaluationConfig, evaluate
-from zest_rl.kitchen.videos import Video
 from zest_rl.metrics import statistics
 from zest_rl.report.comparison_page import compare, dataset_row, gain, learning_curve, method_row, return_curve
 from zest_rl.report.episodes import paired_episodes
@@ -26,6 +25,7 @@ from zest_rl.report.goals import goal_panel, goal_scatter
 from zest_rl.report.methods import Method, latest_evaluation, methods_of_runs
 from zest_rl.report.sections import CAVEATS, DETAILS, EPISODES, GOALS, LEARNING_CURVES, RESULTS
 from zest_rl.runtime.arrays import read_arrays, write_arrays
+from zest_rl.simulation.videos import Video
 
 CONFIG = EvaluationConfig(n_episodes=2, seed=11, rtg="constant")
 
@@ -68,9 +68,9 @@ def test_a_report_compares_methods_with_the_dataset_and_shows_goal_episodes_and_
     assert all(panel.video.stat().st_size > 0 for panel in report.items(EPISODES))
     assert all(panel.scores is not None and len(panel.scores) == len(panel.gt_progress) for panel in single)
     clone, other = (latest_evaluation(evaluated / name) for name in ("bc-0", "dt-0"))
-    gains = other.normalized() - clone.normalized()
+    gains = other.returns() - clone.returns()
     for panel, which, index in zip(paired, ("best", "median", "worst"), np.argsort(-gains)[[0, 1, 1]], strict=True):
-        assert panel.title.startswith(f"BC (left, {clone.normalized()[index]:.0f} %) beside DT on same-scene (right)")
+        assert panel.title.startswith(f"BC (left, {clone.returns()[index]:.0f} %) beside DT on same-scene (right)")
         assert panel.title.endswith(f"{which} gain")
         assert panel.seed == clone.episodes[index].seed == other.episodes[index].seed
         np.testing.assert_array_equal(panel.gt_progress, other.traces["gt_reward"][index])
@@ -106,7 +106,7 @@ def test_a_gain_is_paired_by_start_and_over_seeds(evaluated: Path) -> None:
 def test_a_row_sums_up_the_episodes_of_all_its_seeds(evaluated: Path) -> None:
     groups = [latest_evaluation(evaluated / name) for name in ("bc-0", "bc-1")]
     row = method_row(Method("BC", (), "control", "a note", 80.67), groups)
-    values = np.concatenate([group.normalized() for group in groups])
+    values = np.concatenate([group.returns() for group in groups])
     assert (row.mean, row.iqm) == pytest.approx((values.mean(), float(statistics.iqm(values))))
     assert row.ci_low <= row.mean <= row.ci_high
     assert row.success_rate == np.mean([episode.success for group in groups for episode in group.episodes])
@@ -173,7 +173,7 @@ def test_a_return_curve_holds_the_snapshots_that_were_evaluated_in_every_run(tra
     evaluate(runs[0] / "snapshots" / "update-000000002", replace(CONFIG, seed=77), n_workers=1)
     evaluation = latest_evaluation(runs[0])
     fall = 100 * 10.0 / (evaluation.expert - evaluation.minimum)
-    means = [latest_evaluation(run).normalized().mean() for run in runs]
+    means = [latest_evaluation(run).returns().mean() for run in runs]
     for asked in (CONFIG, None):
         curve = return_curve(replace(method, evaluation=asked))
         assert curve is not None

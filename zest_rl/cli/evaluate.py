@@ -50,8 +50,8 @@ class Config:
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Roll out, summarise, write videos."""
     from zest_rl.evaluation.evaluate import episode_videos, evaluate, evaluation_folder
-    from zest_rl.kitchen.videos import ensure_videos
     from zest_rl.runtime.hub import local_run
+    from zest_rl.simulation.videos import ensure_videos
 
     started, asked, folder = time.monotonic(), settings(config), local_run(config.run)
     with ui.progress("episodes", config.n_episodes) as advance:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from zest_rl.errors import Notice, ZestError
 from zest_rl.evaluation.environments import RunEnvironment
 from zest_rl.evaluation.rollout import Traces
-from zest_rl.kitchen.videos import FPS, States, Video
+from zest_rl.kitchen.videos import KitchenOverview
 from zest_rl.simulation.makers import check_named
+from zest_rl.simulation.videos import Overview, Trajectory, Video
 from zest_rl.sources.stage import Stage, stage_of
 from zest_rl.sources.states import check_env
 from zest_rl.types import Frame
@@ -20,15 +21,14 @@ from zest_rl.types import Frame
 
 @dataclass(frozen=True)
 class EnvironmentOverview:
-    """The `zest_rl.kitchen.videos.Overview` of any MuJoCo environment: its own camera, where it is at the start."""
+    """The `zest_rl.simulation.videos.Overview` of any MuJoCo environment: its own camera, where it is at the start."""
 
     made_by: str
     """See `RunEnvironment`."""
     fps: float
 
-    def frames(self, states: States) -> Iterator[Frame]:
+    def frames(self, states: Trajectory) -> Iterator[Frame]:
         """Draw the states of an episode, by their parts."""
-        assert isinstance(states, Mapping)
         stage, n_states = stage_of(self.made_by, ()), len(states["qpos"])
         steps = [{name: part[step] for name, part in states.items()} for step in range(n_states)]
         pose = None if stage.is_fixed else stage.default_pose(steps[0])
@@ -51,20 +51,16 @@ def episode_video(
     Returns:
         None where the environment cannot be drawn; a `Notice` says why.
     """
-    if environment.is_kitchen:
-        return Video(traces["qpos"][index], path, None if beside is None else beside["qpos"][index])
-    if not _can_draw(environment.made_by, environment.name, bool(environment.state)):
-        return None
+    overview: Overview = KitchenOverview()
+    if not environment.is_kitchen:
+        if not _can_draw(environment.made_by, environment.name, bool(environment.state)):
+            return None
+        overview = EnvironmentOverview(environment.made_by, environment.fps)
     shown = [each for each in (traces, beside) if each is not None]
-    n_frames = max(int(each["n_steps"][index]) for each in shown) + 1
-    states = [{name: each[name][index, :n_frames] for name in environment.state} for each in shown]
-    overview = EnvironmentOverview(environment.made_by, environment.fps)
-    return Video(states[0], path, states[1] if beside is not None else None, overview)
-
-
-def frames_per_second(environment: RunEnvironment) -> float:
-    """Return the steps per second of its videos."""
-    return FPS if environment.is_kitchen else environment.fps
+    n_steps = max((int(each["n_steps"][index]) for each in shown if "n_steps" in each), default=None)
+    end = None if n_steps is None else n_steps + 1
+    states = [{name: each[name][index, :end] for name in environment.state} for each in shown]
+    return Video(states[0], path, overview, *states[1:])
 
 
 @functools.cache

@@ -17,7 +17,6 @@ from zest_rl.data.provenance import DatasetRecord
 from zest_rl.data.reader import dataset_path, exists, open_dataset
 from zest_rl.errors import BadInput
 from zest_rl.evaluation.evaluate import Evaluation, evaluation_folder, read_evaluation
-from zest_rl.kitchen.videos import Film, ensure_video
 from zest_rl.metrics.statistics import Estimate, bootstrap, iqm, normalized_return
 from zest_rl.report.content import MethodRow, Series, TaskTable
 from zest_rl.report.episodes import paired_episodes, representative_episodes
@@ -39,6 +38,7 @@ from zest_rl.rewards.scorer import SCORER_FILE, check_scorer
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime.files import check_file
 from zest_rl.runtime.records import reading_record
+from zest_rl.simulation.videos import Film, ensure_video
 from zest_rl.training.checkpoints import snapshots
 
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from zest_rl.evaluation.evaluate import Evaluation
-from zest_rl.evaluation.videos import episode_video, frames_per_second
-from zest_rl.kitchen.videos import Film
+from zest_rl.evaluation.videos import episode_video
 from zest_rl.metrics.statistics import representative
 from zest_rl.report.content import EpisodePanel
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
+from zest_rl.simulation.videos import Film
 from zest_rl.types import FloatArray
 
 
@@ -79,7 +79,7 @@ def _panel(
         value=float(evaluation.returns()[index]),
         success=evaluation.episodes[index].success,
         video=video,
-        fps=frames_per_second(evaluation.environment),
+        fps=evaluation.environment.fps,
         gt_progress=_progress(evaluation, index, n_frames),
         is_normalized=evaluation.is_normalized,
         is_progress=evaluation.environment.is_kitchen,

@@ -17,9 +17,9 @@ from zest_rl.cli.reproduce.tasks import GivenDataset, check_given
 from zest_rl.cli.ui import Ui
 
 if TYPE_CHECKING:
-    from zest_rl.kitchen.videos import Video
     from zest_rl.report.methods import Method
     from zest_rl.report.sections import Report
+    from zest_rl.simulation.videos import Video
 
 
 def run_comparison(
@@ -33,9 +33,9 @@ def run_comparison(
 ) -> dict[str, Any]:
     """Collect, relabel, train, evaluate and report what is not done yet; `recipe` is the name of the recipe's file."""
     from zest_rl.cli import inspect
-    from zest_rl.kitchen.videos import ensure_videos, missing
     from zest_rl.report.html import write_report
     from zest_rl.runtime import artifacts
+    from zest_rl.simulation.videos import ensure_videos, missing
 
     given = {name: task for name, task in comparison.tasks.items() if isinstance(task, GivenDataset)}
     check_given(given, f"recipe {recipe}")
