@@ -231,9 +231,9 @@ def test_results_are_sums_over_the_traces_and_can_be_read_again(trained: Path) -
         assert episode.gt_return == pytest.approx(float(result.traces["gt_reward"][i, 1:].sum()))
         assert episode.zest_return == pytest.approx(float(result.traces["score"][i, 1:].sum()), abs=1e-4)
         assert episode.success == bool(result.traces["gt_success"][i].any())
-    np.testing.assert_allclose(result.normalized(), [100 * e.gt_return / 70 for e in result.episodes])
+    np.testing.assert_allclose(result.returns(), [100 * e.gt_return / 70 for e in result.episodes])
     summary = result.summary()
-    assert summary["normalized_return"]["value"] == pytest.approx(result.normalized().mean())
+    assert summary["normalized_return"]["value"] == pytest.approx(result.returns().mean())
     assert summary["n_episodes"] == 2
     assert summary["target_return"] is None
     again = read_evaluation(evaluation_folder(trained / "bc-0", ONLINE))

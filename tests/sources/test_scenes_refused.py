@@ -12,7 +12,7 @@ import pytest
 from rollouts import Run
 
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.simulation.makers import find_maker
+from zest_rl.simulation.makers import make_named
 from zest_rl.simulation.recorder import Recorder
 from zest_rl.sources import open_source
 
@@ -47,6 +47,7 @@ def frame(): return model(block("arm") + block("box") + '<body name="frame"/>', 
 def meshless(): return model(block("box"), '<asset><mesh name="m" file="gone.stl"/></asset>')
 def pole(): return gymnasium.make("CartPole-v1")
 def sized(size): return pushing()
+def nothing(): return None
 value = 3
 """
 
@@ -61,7 +62,7 @@ def blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def record(make: str, *, moves_bodies: bool = False) -> str:
-    env = Recorder(find_maker(f"blocks:{make}")())
+    env = Recorder(make_named(f"blocks:{make}"))
     env.reset(seed=0)
     for _ in range(3):
         env.step(np.array([0.1], np.float32))
@@ -92,6 +93,7 @@ def test_a_scene_that_cannot_be_told_is_refused(blocks: str, make: str, options:
         ("pole", BadInput, "blocks:pole has no MuJoCo model to render; give --frames FOLDER"),
         ("meshless", ZestError, r"blocks:meshless cannot be made here .*gone\.stl"),
         ("sized", BadInput, r"sized\(size\) must be called without arguments"),
+        ("nothing", BadInput, "--env blocks:nothing must return a gymnasium.Env, got NoneType; return the environment"),
         ("value", BadInput, r"blocks \(.*blocks\.py\) has no function 'value'"),
         ("taller", BadInput, "body_pos must hold 12 numbers for blocks:taller, got 9; install the version"),
     ],

@@ -19,8 +19,6 @@ from zest_rl.runtime.files import check_file, user_path
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
 
-MAKER = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
-"""``package.module:make``, a function that makes an environment; only the user may name one, never the data."""
 WRAPPERS = frozenset(
     f"gymnasium.wrappers.{name}"
     for name in (
@@ -42,6 +40,11 @@ WRAPPERS = frozenset(
 )
 """What may be made round an environment because a file says so: they read and write no files."""
 TRUSTED_ENTRY_POINTS = ("gymnasium.", "gymnasium_robotics.", "zest_rl.")
+
+
+def is_maker(env: str) -> bool:
+    """Whether it is ``package.module:make``, a function that makes an environment; only the user may name one."""
+    return re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", env) is not None
 
 
 def entry_points(env_spec: str, what: str) -> list[str]:

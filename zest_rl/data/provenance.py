@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Self
 
-from zest_rl.data.env_specs import MAKER
+from zest_rl.data.env_specs import is_maker
 from zest_rl.errors import BadInput
 from zest_rl.runtime.records import field_values, from_json
 
@@ -215,7 +215,7 @@ class DatasetRecord:
     def maker(self) -> str | None:
         """``package.module:make`` that the user named when it was relabeled; None without any."""
         env = None if self.relabel is None else (self.relabel.frames or {}).get("env_id")
-        return env if isinstance(env, str) and MAKER.fullmatch(env) else None
+        return env if isinstance(env, str) and is_maker(env) else None
 
     @property
     def source_id(self) -> str:

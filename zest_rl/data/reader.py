@@ -163,8 +163,7 @@ class Dataset:
     @property
     def has_truth(self) -> bool:
         """Whether there is something to judge by; `truth` refuses a dataset where some episodes lack it."""
-        judged = self._own_rewards() is not None or self.successes() is not None
-        return self.is_hand_rewarded or (judged and self.record.task is None)
+        return self.is_hand_rewarded or self._own_truth is not None
 
     def truth(self) -> list[GroundTruth]:
         """Read what judges every episode: for evaluation and reports only, never for a trainer.
@@ -175,14 +174,21 @@ class Dataset:
         Raises:
             BadInput: none is recorded.
         """
-        if self.is_hand_rewarded or not self.has_truth:
+        if self.is_hand_rewarded or self._own_truth is None:
             return self._each(
                 lambda arrays: GroundTruth(
                     rewards=arrays.read(_GT_REWARD, n_more=1)[1:],
                     success=bool(arrays.read("infos/gt/success", n_more=1).any()),
                 )
             )
+        return self._own_truth
+
+    @cached_property
+    def _own_truth(self) -> list[GroundTruth] | None:
+        """What another robot's dataset holds to judge by; None without any."""
         own, successes = self._own_rewards(), self.successes()
+        if self.record.task is not None or (own is None and successes is None):
+            return None
         told = [None] * len(self.groups) if successes is None else [bool(success.any()) for success in successes]
         rewards = [success.astype(np.float32) for success in successes or ()] if own is None else own
         return [GroundTruth(*episode) for episode in zip(rewards, told, strict=True)]

@@ -19,24 +19,25 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from zest_rl.data.env_specs import (
-    MAKER,
     WRAPPERS,
     check_env_spec,
     check_model_files,
     check_registered,
+    is_maker,
     without_wrappers,
 )
 from zest_rl.data.observations import by_path, flatten, numeric_paths, observed
 from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput, Notice, ZestError, nearest
 from zest_rl.kitchen.env import ENV_ID, env_spec
+from zest_rl.kitchen.videos import FPS
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.records import from_json
-from zest_rl.simulation.makers import check_named, find_maker, named_by_user, source_sha256
+from zest_rl.simulation.makers import check_named, make_named, named_by_user, source_sha256
 from zest_rl.simulation.recorder import DATA_FIELDS, MODEL_FIELDS, SUCCESS_KEYS
 from zest_rl.sources import state_plugins
 from zest_rl.sources.recorded_envs import recorded_env, running_state
-from zest_rl.sources.stage import env_facts
+from zest_rl.sources.stage import env_facts, model_sha256
 from zest_rl.sources.states import versions
 from zest_rl.types import FloatArray
 
@@ -44,7 +45,7 @@ MAX_HORIZON = 10_000
 """Steps of an episode."""
 _MOST_PROBED = 1000  # steps in which success is looked for
 _INSTEAD = "give --env package.module:make, a function that makes it"
-_KITCHEN_STEPS_PER_SECOND, _STEPS_PER_SECOND = 12.5, 25.0
+_STEPS_PER_SECOND = 25.0
 
 
 @dataclass(frozen=True)
@@ -64,12 +65,12 @@ class RunEnvironment:
     observed: tuple[str, ...] = ("",)
     """Paths of the observations that a policy is given, as `zest_rl.data.observations.numbers` chooses them."""
     code_sha256: str = ""
-    """Of the versions of its packages and the file that makes it, so that one that was changed is evaluated again."""
+    """Of its packages' versions, its model and the files that make it: one that was changed is evaluated again."""
 
     @property
     def is_kitchen(self) -> bool:
         """Whether it is zest/Kitchen-v1, whose episodes all last until the horizon."""
-        return self.success_key == "gt/success" and MAKER.fullmatch(self.made_by) is None
+        return self.success_key == "gt/success" and not is_maker(self.made_by)
 
     @property
     def name(self) -> str:
@@ -100,7 +101,7 @@ class RunEnvironment:
         return told | running_state(env.unwrapped, self.state)
 
 
-KITCHEN = RunEnvironment("", 1, "gt/success", ("qpos",), _KITCHEN_STEPS_PER_SECOND)
+KITCHEN = RunEnvironment("", 1, "gt/success", ("qpos",), FPS)
 """What a kept evaluation in zest/Kitchen-v1 says of it: there is nothing to choose."""
 
 
@@ -182,48 +183,38 @@ def _parsed(text: str) -> EnvSpec:
 
 
 def _name(made_by: str) -> str:
-    return made_by if MAKER.fullmatch(made_by) else _parsed(without_wrappers(made_by)).id
+    return made_by if is_maker(made_by) else _parsed(without_wrappers(made_by)).id
 
 
 def _make(made_by: str, horizon: int | None) -> gymnasium.Env[Any, Any]:
-    """Make an environment that ends its episodes at the horizon.
-
-    Raises:
-        BadInput: what the user names is no function, or makes no environment.
-        ZestError: its code fails.
-    """
-    name = _name(made_by)
+    """Make an environment; one that is made by its id ends its episodes at the horizon. Raises as `make_named`."""
+    if is_maker(made_by):
+        return make_named(made_by)
+    spec = _parsed(made_by)
+    kwargs = {key: value for key, value in spec.kwargs.items() if key != "render_mode"}  # no windows
+    spec = replace(spec, kwargs=kwargs, max_episode_steps=horizon or spec.max_episode_steps)
     try:
-        if MAKER.fullmatch(made_by):
-            env: Any = find_maker(made_by)()
-        else:
-            spec = _parsed(made_by)
-            kwargs = {key: value for key, value in spec.kwargs.items() if key != "render_mode"}  # no windows
-            spec = replace(spec, kwargs=kwargs, max_episode_steps=horizon or spec.max_episode_steps)
-            env = gymnasium.make(spec, disable_env_checker=True)
-    except BadInput:
-        raise
+        return gymnasium.make(spec, disable_env_checker=True)
     except Exception as error:  # whatever an environment raises
-        advice = f"install what it needs in the version that it was recorded with, or {_INSTEAD}"
-        if MAKER.fullmatch(made_by):
-            advice = "mend the function, or install what it needs"
-        raise ZestError(f"{name} cannot be made here ({type(error).__name__}: {error}); {advice}") from error
-    if not isinstance(env, gymnasium.Env):
-        raise BadInput(f"--env {name} must return a gymnasium.Env, got {type(env).__name__}; return the environment")
-    return env
+        raise ZestError(
+            f"{spec.id} cannot be made here ({type(error).__name__}: {error}); install what it needs in the version "
+            f"that it was recorded with, or {_INSTEAD}"
+        ) from error
 
 
 def _probed(made_by: str, meta: Mapping[str, Any], horizon: int | None, success_key: str | None) -> RunEnvironment:
     """Make an environment, take one step, and see what it tells."""
     env = _make(made_by, horizon)
     name, bare = _name(made_by), env.unwrapped
+    model: Any = getattr(bare, "model", None)
+    has_model = isinstance(model, mujoco.MjModel)
     try:
         if not isinstance(env.action_space, gymnasium.spaces.Box):
             raise BadInput(f"a policy here acts by continuous actions (Box), but {name} takes {env.action_space}")
         compiled = _model_fields(bare)
         env.action_space.seed(0)
         first, _ = env.reset(seed=0)
-        after_reset = _model_fields(bare)
+        after_reset, model_hash = _model_fields(bare), model_sha256(model) if has_model else None
         paths = numeric_paths([first])
         _check_spaces(name, first, paths, env.action_space, meta)
         own_horizon = None if env.spec is None else env.spec.max_episode_steps
@@ -249,10 +240,10 @@ def _probed(made_by: str, meta: Mapping[str, Any], horizon: int | None, success_
         made_by,
         steps,
         key,
-        state if isinstance(getattr(bare, "model", None), mujoco.MjModel) else (),
+        state if has_model else (),
         float(fps) if isinstance(fps, int | float) and 0 < fps <= 1000 else _STEPS_PER_SECOND,
         paths,
-        artifacts.hash_json([versions(), source_sha256(made_by) if MAKER.fullmatch(made_by) else None]),
+        artifacts.hash_json([versions(), model_hash, source_sha256(made_by) if is_maker(made_by) else None]),
     )
 
 

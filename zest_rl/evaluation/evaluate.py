@@ -23,7 +23,6 @@ from zest_rl.evaluation.environments import KITCHEN, MAX_HORIZON, RunEnvironment
 from zest_rl.evaluation.rollout import Rtg, Traces, run_episodes, uses_online_scores
 from zest_rl.evaluation.videos import episode_video
 from zest_rl.kitchen.scene import N_QPOS
-from zest_rl.kitchen.videos import Video, ensure_videos
 from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return, representative, wilson
 from zest_rl.rewards.scorer import SCORER_FILE, check_scorer
 from zest_rl.rewards.state_scorer import StateScorer
@@ -31,6 +30,7 @@ from zest_rl.runtime import artifacts
 from zest_rl.runtime.hub import local_run
 from zest_rl.runtime.parallel import cached_jobs, chunks, one_thread, read_parts
 from zest_rl.runtime.records import from_json, reading_record
+from zest_rl.simulation.videos import Video, ensure_videos
 from zest_rl.types import EpisodeResult
 
 EPISODES_PER_JOB, N_JOBS = 5, 10
@@ -120,16 +120,6 @@ class Evaluation:
         return (
             sums if self.minimum is None or self.expert is None else normalized_return(sums, self.minimum, self.expert)
         )
-
-    def normalized(self) -> NDArray[np.float64]:
-        """Normalized return of each episode, in percent: (N,).
-
-        Raises:
-            BadInput: the dataset has no references.
-        """
-        if not self.is_normalized:
-            raise BadInput(f"{self.run.name} has no normalized returns: its dataset has no reference scores")
-        return self.returns()
 
     def summary(self) -> dict[str, Any]:
         """Return as JSON mean with interval, IQM, success rate; of a foreign policy, the share of clipped actions.
@@ -235,13 +225,7 @@ def evaluate(
         raise BadInput(f"scores are needed, but {run.name} has no {SCORER_FILE}: {reason}")
     if scored:
         check_scorer(run / SCORER_FILE, trust=trust)
-    folder = evaluation_folder(run, config)
-    jobs: dict[str, _Job] = {}
-    for part in chunks(config.n_episodes, max(EPISODES_PER_JOB, config.n_episodes // N_JOBS)):
-        seeds = range(config.seed + part.start, config.seed + part.stop)
-        stamp = "" if environment.is_kitchen else f"-{artifacts.hash_json(asdict(environment))[:8]}"
-        name = f"seeds-{seeds.start}-{seeds.stop}{'-scored' if scored else ''}{stamp}"
-        jobs[name] = (run, config, environment, seeds, scored, device)
+    folder, jobs = evaluation_folder(run, config), _jobs(run, config, environment, scored, device)
     minimum, expert = _references(dataset, policy.meta, config, environment)
     with artifacts.lock(folder):
         if not environment.is_kitchen and not all((folder / "parts" / f"{name}.npz").exists() for name in jobs):
@@ -251,32 +235,42 @@ def evaluate(
             if on_progress is not None:
                 on_progress(len(jobs[name][3]))
         traces = _read_traces(folder, list(jobs), config, environment)
-        result = Evaluation(
-            run,
-            config,
-            target_return(policy, config),
-            minimum,
-            expert,
-            _episode_results(traces, config),
-            traces,
-            environment,
-        )
-        artifacts.write_json(
-            folder / "result.json",
-            {
-                "config": config.to_json(),
-                "agent": policy.agent,
-                "references": {"minimum": minimum, "expert": expert},
-                **({} if environment.is_kitchen else {"environment": asdict(environment)}),
-                "summary": result.summary(),
-                "episodes": [asdict(episode) for episode in result.episodes],
-                "parts": list(jobs),
-                "provenance": artifacts.provenance(),
-            },
-        )
+        target, episodes = target_return(policy, config), _episode_results(traces, config)
+        result = Evaluation(run, config, target, minimum, expert, episodes, traces, environment)
+        _write(result, policy.agent, list(jobs))
         if videos:
             ensure_videos(episode_videos(result).values(), n_workers=n_workers)
     return result
+
+
+def _jobs(
+    run: Path, config: EvaluationConfig, environment: RunEnvironment, scored: bool, device: str
+) -> dict[str, _Job]:
+    """Return the parts of an evaluation by names that tell all that their traces depend on."""
+    jobs = {}
+    stamp = "" if environment.is_kitchen else f"-{artifacts.hash_json(asdict(environment))[:8]}"
+    for part in chunks(config.n_episodes, max(EPISODES_PER_JOB, config.n_episodes // N_JOBS)):
+        seeds = range(config.seed + part.start, config.seed + part.stop)
+        name = f"seeds-{seeds.start}-{seeds.stop}{'-scored' if scored else ''}{stamp}"
+        jobs[name] = (run, config, environment, seeds, scored, device)
+    return jobs
+
+
+def _write(result: Evaluation, agent: str, parts: Sequence[str]) -> None:
+    """Write ``result.json``; `read_evaluation` is the way back."""
+    artifacts.write_json(
+        result.folder / "result.json",
+        {
+            "config": result.config.to_json(),
+            "agent": agent,
+            "references": {"minimum": result.minimum, "expert": result.expert},
+            **({} if result.environment.is_kitchen else {"environment": asdict(result.environment)}),
+            "summary": result.summary(),
+            "episodes": [asdict(episode) for episode in result.episodes],
+            "parts": list(parts),
+            "provenance": artifacts.provenance(),
+        },
+    )
 
 
 def _references(

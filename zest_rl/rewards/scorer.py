@@ -15,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.data.env_specs import MAKER
+from zest_rl.data.env_specs import is_maker
 from zest_rl.data.provenance import ScorerRecord
 from zest_rl.embedders import DEFAULT_EMBEDDER, Embedder, Precision
 from zest_rl.errors import BadInput, ZestError
@@ -245,7 +245,7 @@ def check_scorer(path: Path, *, trust: bool = False) -> None:
     config, views, *_ = _read(path)
     if trust:
         remember("embedder", config.embedder)
-        if isinstance(views, SceneViews) and MAKER.fullmatch(views.env_spec):
+        if isinstance(views, SceneViews) and is_maker(views.env_spec):
             named_by_user(views.env_spec)
     _check_named(path, config, views)
 

@@ -20,7 +20,8 @@ Bodies = NDArray[np.bool_]
 """(nbody,) whether each body of a model belongs to a set."""
 _STILL, _ALIKE = 1e-3, 0.9
 """Metres of movement that count as none; and the share of the largest movement from which another is as large."""
-_INSTEAD = "name what to look at with --look-at BODY, or use a camera of the model (--camera NAME, or default)"
+_BY_CAMERA = "use a camera of the model (--camera NAME, or default)"
+_INSTEAD = f"name what to look at with --look-at BODY, or {_BY_CAMERA}"
 
 
 def body_name(model: mujoco.MjModel, body: int) -> str:
@@ -138,7 +139,7 @@ def moved_body(model: mujoco.MjModel, travel: NDArray[np.float64], robot: Bodies
     if len(joints) == 0:
         raise BadInput(
             "the object is the body of an unactuated joint, but all joints of the model belong to the robot; keep the "
-            f"robot in view (--show-robot --look-at BODY), or {_INSTEAD.partition(', or ')[2]}"
+            f"robot in view (--show-robot --look-at BODY), or {_BY_CAMERA}"
         )
     by_body = dict[int, float]()
     for joint in joints:

@@ -6,16 +6,21 @@ Only the user may name one, by ``--env`` or, once he did, by what he relabeled w
 
 from __future__ import annotations
 
+import ast
 import importlib
 import importlib.util
 import inspect
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from zest_rl.data.env_specs import MAKER
-from zest_rl.errors import BadInput, nearest
+import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
+import gymnasium
+
+from zest_rl.data.env_specs import is_maker
+from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.trust import is_remembered, remember
 
@@ -26,7 +31,7 @@ def named_by_user(env: str) -> str:
     Raises:
         BadInput: it is not ``package.module:make``.
     """
-    if MAKER.fullmatch(env) is None:
+    if not is_maker(env):
         raise BadInput(f"--env must be package.module:make, a function that makes an environment, got {env!r}")
     remember("environment", _identity(env))
     return env
@@ -43,7 +48,7 @@ def check_named(env: str, what: str) -> None:
     Raises:
         BadInput: it would run code that this user did not name.
     """
-    if MAKER.fullmatch(env) and not is_named(env):
+    if is_maker(env) and not is_named(env):
         where = _file(env) or f"no such module in {Path.cwd()}: go to the folder that holds it"
         raise BadInput(
             f"{what} names {env} ({where}) as the function that makes its environment, which you did not name on this "
@@ -51,10 +56,45 @@ def check_named(env: str, what: str) -> None:
         )
 
 
-def source_sha256(env: str) -> str | None:
-    """Return the hash of the file of a function's module (not of what it imports); None without any."""
-    file = _file(env)
-    return None if file is None else artifacts.hash_file(file)
+def source_sha256(env: str) -> str:
+    """Return the hash of the code of a function: its module, and what this imports of its own package or folder."""
+    return artifacts.hash_json({name: artifacts.hash_file(file) for name, file in sorted(_sources(env).items())})
+
+
+def _sources(env: str) -> dict[str, Path]:
+    """Return the files of a function's code by the names of their modules, found without running any of it."""
+    module = env.partition(":")[0]
+    file, found, wanted = _file(module), dict[str, Path](), [module]
+    is_alone = file is not None and "." not in module and not file.parent.name.endswith("-packages")
+    folder = file.parent if file is not None and is_alone else None  # that of installed packages is not its own
+
+    def is_own(name: str) -> bool:
+        first = name.partition(".")[0]
+        return first == module.partition(".")[0] or (
+            folder is not None and ((folder / f"{first}.py").is_file() or (folder / first).is_dir())
+        )
+
+    while wanted:
+        name = wanted.pop()
+        if name in found or not is_own(name) or (file := _file(name)) is None:
+            continue
+        found[name] = file
+        package = name if file.name == "__init__.py" else name.rpartition(".")[0]
+        wanted += [name.rpartition(".")[0], *_imported(file, package)]
+    return found
+
+
+def _imported(file: Path, package: str) -> list[str]:
+    """Return the names of all modules that a file of a package may import."""
+    names = list[str]()
+    for node in ast.walk(ast.parse(file.read_bytes())) if file.suffix == ".py" else ():
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            with suppress(ImportError):  # a script may try a relative import first
+                base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
+                names += [base, *(f"{base}.{alias.name}" for alias in node.names)]
+    return names
 
 
 def _identity(env: str) -> dict[str, str | None]:
@@ -85,12 +125,28 @@ def _look_here() -> None:
         sys.path.append(here)
 
 
-def find_maker(maker: str) -> Callable[[], Any]:
-    """Import a function of the working directory or an installed package.
+def make_named(maker: str) -> gymnasium.Env[Any, Any]:
+    """Make an environment by a function of the working directory or an installed package.
 
     Raises:
-        BadInput: there is no such module or function, or it needs arguments.
+        BadInput: there is no such module or function, it needs arguments, or it makes no environment.
+        ZestError: its code fails.
     """
+    try:
+        env: Any = _find(maker)()
+    except BadInput:
+        raise
+    except Exception as error:  # whatever an environment raises
+        raise ZestError(
+            f"{maker} cannot be made here ({type(error).__name__}: {error}); mend the function, or install what it "
+            "needs"
+        ) from error
+    if not isinstance(env, gymnasium.Env):
+        raise BadInput(f"--env {maker} must return a gymnasium.Env, got {type(env).__name__}; return the environment")
+    return env
+
+
+def _find(maker: str) -> Callable[[], Any]:
     module_name, _, name = maker.partition(":")
     _look_here()
     try:

@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import zest_rl.kitchen.env  # noqa: F401  # registers its environment, and those of gymnasium-robotics
-from zest_rl.data.env_specs import MAKER, check_registered, without_wrappers
+from zest_rl.data.env_specs import check_registered, is_maker, without_wrappers
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime import artifacts
-from zest_rl.simulation.makers import find_maker
+from zest_rl.simulation.makers import make_named
 from zest_rl.simulation.recorder import DATA_FIELDS, MODEL_FIELDS
 from zest_rl.simulation.rendering import Canvas
 from zest_rl.sources import state_plugins
@@ -48,15 +48,20 @@ class Groups:
     """(nsite,)."""
 
 
+def model_sha256(model: mujoco.MjModel) -> str:
+    """Hash a model as it is compiled, meshes and textures included."""
+    compiled = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, compiled)
+    return artifacts.hash_arrays(compiled)
+
+
 class Simulation:
     """An environment in which recorded states are restored."""
 
     def __init__(self, env: Any, entry_point: str) -> None:
-        """Take an environment without its wrappers; see `simulation_of`."""
+        """Take an environment without its wrappers; see `make_simulation`."""
         self.env, self.model, self.data = env, env.model, env.data
-        compiled = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
-        mujoco.mj_saveModel(self.model, None, compiled)
-        self.model_sha256 = artifacts.hash_arrays(compiled)
+        self.model_sha256 = model_sha256(self.model)
         self.groups = Groups(self.model.geom_group.copy(), self.model.site_group.copy())
         """As the environment made them."""
         self._made = [
@@ -142,9 +147,7 @@ def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
 
 def env_facts(env_spec: str) -> dict[str, Any]:
     """Return an EnvSpec (JSON) as a dictionary; of ``package.module:make`` it has that as id and entry point."""
-    facts: dict[str, Any] = (
-        {"id": env_spec, "entry_point": env_spec} if MAKER.fullmatch(env_spec) else json.loads(env_spec)
-    )
+    facts: dict[str, Any] = {"id": env_spec, "entry_point": env_spec} if is_maker(env_spec) else json.loads(env_spec)
     return facts
 
 
@@ -158,8 +161,8 @@ def make_simulation(env_spec: str) -> Simulation:
         BadInput: neither, not a registered environment, or one without a MuJoCo model.
         ZestError: the environment cannot be made with the packages here.
     """
-    if MAKER.fullmatch(env_spec):
-        return Simulation(_bare(lambda: find_maker(env_spec)(), env_spec), env_spec)
+    if is_maker(env_spec):
+        return Simulation(_bare(lambda: make_named(env_spec), env_spec), env_spec)
     try:
         spec = gymnasium.envs.registration.EnvSpec.from_json(without_wrappers(env_spec))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -181,7 +184,7 @@ def _bare(make: Callable[[], Any], name: str) -> Any:
     try:
         with redirect_stderr(StringIO()):  # on import gymnasium_robotics prints news of its other environments
             env: Any = make().unwrapped
-    except BadInput:
+    except ZestError:
         raise
     except Exception as error:  # whatever an environment raises
         raise ZestError(

@@ -18,7 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from zest_rl.data.env_specs import MAKER, check_env_spec, check_model_files, entry_points, without_wrappers
+from zest_rl.data.env_specs import check_env_spec, check_model_files, entry_points, is_maker, without_wrappers
 from zest_rl.data.hdf5 import check_rows, open_hdf5, read_array
 from zest_rl.data.observations import entries
 from zest_rl.errors import BadInput, ZestError
@@ -154,7 +154,7 @@ def check_env(env_spec: str | None, what: str) -> str:
             "states could be rendered; give --env package.module:make, a function that makes it, or --frames FOLDER "
             "with a video of each episode"
         )
-    if MAKER.fullmatch(env_spec):
+    if is_maker(env_spec):
         return env_spec
     entry_points(env_spec, f"the env_spec of {what}")
     spec = json.loads(env_spec)
