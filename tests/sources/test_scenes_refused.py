@@ -112,5 +112,7 @@ def test_a_function_that_makes_an_environment_is_refused_where_none_is_made(pict
 
 
 def test_models_that_are_told_are_seen_by_the_command(blocks: str, goal: Path, zest: Run) -> None:
-    preview = zest("relabel", record("pushing"), "--env", "blocks:pushing", "--goal", goal, "--preview", "look.png")
+    words = ("relabel", record("pushing"), "--env", "blocks:pushing", "--goal", goal, "--views", 2)
+    preview = zest(*words, "--preview", "look.png")
     assert Path(preview["preview"]).stat().st_size > 1000
+    assert sorted(preview["next"].split()) == sorted(["zest", *map(str, words)])

@@ -55,6 +55,19 @@ def arguments_of(config_class: type[Any]) -> dict[str, Argument]:
     return arguments
 
 
+def words_of(config: Any) -> list[str]:
+    """Return what a user types after the verb to get a config: whatever differs from its defaults."""
+    words = list[str]()
+    defaults = {field.name: field.default for field in dataclasses.fields(config)}
+    for field, argument in arguments_of(type(config)).items():
+        value = getattr(config, field)
+        if argument.is_flag and value != defaults[field]:
+            words.append(f"--no-{hyphenated(field)}" if value is False else argument.name)
+        if value != defaults[field] and not isinstance(value, bool):
+            words += map(str, value if isinstance(value, tuple) else [value])
+    return words
+
+
 def docs_of(config_class: type[Any]) -> dict[str, str]:
     """Return what the string below a field says, by field, in one line."""
     docs = {}

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from zest_rl.cli.arguments import words_of
 from zest_rl.cli.ui import Ui
 
 
@@ -46,8 +47,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     chosen = {name: getattr(config, name) for name in ("frames", "env", "robot", "look_at", "show_robot", "masks")}
     folder, goal = write_goal(config.dataset, config.episode, config.output, cameras=config.camera, **chosen)
     is_video = Path(config.dataset).suffix.lower() in VIDEO_SUFFIXES
-    words = ["zest", "relabel", "DATASET" if is_video else config.dataset, "--goal", str(folder)]
-    for name, value in {"camera": config.camera, **chosen}.items():
-        given = [] if value is True else [value] if isinstance(value, str) else list(value or ())
-        words += [f"--{name.replace('_', '-')}", *given] if value else []
-    return {"goal": str(folder), "n_views": len(goal.goals), "next": shlex.join(words)}
+    seen = replace(config, episode=Config.episode, output=Config.output)
+    words = words_of(replace(seen, dataset="DATASET") if is_video else seen)
+    command = shlex.join(["zest", "relabel", *words, "--goal", str(folder)])
+    return {"goal": str(folder), "n_views": len(goal.goals), "next": command}

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from zest_rl.cli.arguments import words_of
 from zest_rl.cli.relabel.arguments import Config
 from zest_rl.cli.ui import Ui, progress_in_parts
 
@@ -38,7 +41,8 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     options = {name: value for name, value in vars(config).items() if name != "preview"}
     if config.preview is not None:
         shown = preview(config.preview, **options)
-        return {"preview": str(config.preview), "episode": shown, "next": "the same command without --preview"}
+        command = shlex.join(["zest", "relabel", *words_of(replace(config, preview=None))])
+        return {"preview": str(config.preview), "episode": shown, "next": command}
     started = time.monotonic()
     with progress_in_parts(ui, "embedding frames") as on_progress:
         relabeled = relabel(**options, on_start=tell, on_progress=on_progress)
