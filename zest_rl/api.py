@@ -6,7 +6,7 @@ run is the folder that `train` returned.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import fields
 from pathlib import Path
@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 from zest_rl.errors import BadInput, nearest
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from zest_rl.agents import Policy
     from zest_rl.analysis.cross_task import JointInspection
     from zest_rl.data.reader import Dataset
@@ -89,6 +91,21 @@ def relabel(dataset: AnyDataset, goal: str | Path = "same-scene", **flags: Any) 
     from zest_rl.rewards.relabel import relabel as relabel_dataset
 
     return relabel_dataset(_id(dataset), str(goal), **flags)
+
+
+def with_rewards(dataset: AnyDataset, rewards: Sequence[ArrayLike], label: str = "given") -> str:
+    """Write a copy of a dataset that has rewards of your own, and return its id.
+
+    See `zest_rl.rewards.given.with_rewards`.
+
+    Args:
+        dataset: relabeled or not.
+        rewards: (T,) of every episode, in order; r_t rewards a_t.
+        label: a word that reports and the new id call them by.
+    """
+    from zest_rl.rewards.given import with_rewards as with_rewards_of_id
+
+    return with_rewards_of_id(_id(dataset), rewards, label)
 
 
 def inspect(

@@ -1,7 +1,8 @@
 """How a dataset was made: typed records of the entry "zest" in its metadata, which a run's ``meta.json`` repeats.
 
-Up to three stages leave a record: ``collect`` (`CollectRecord`), ``recorded`` (steps per second of an imported dataset)
-and ``relabel`` (`RelabelRecord`). Fields that an earlier version did not write have defaults; unknown ones are ignored.
+Stages that leave a record: ``collect`` (`CollectRecord`), ``recorded`` (steps per second of an imported dataset), and
+what made the rewards, ``relabel`` (`RelabelRecord`) or ``given`` (`GivenRecord`). Fields that an earlier version did
+not write have defaults; unknown ones are ignored.
 """
 
 from __future__ import annotations
@@ -138,6 +139,20 @@ class RelabelRecord:
 
 
 @dataclass(frozen=True)
+class GivenRecord:
+    """Rewards that somebody gave as numbers (`zest_rl.rewards.given`)."""
+
+    label: str
+    """What reports call them."""
+    source: str
+    """Id of the dataset that they were given for."""
+    source_sha256: str
+    """Its fingerprint: everything that training may see, except the rewards."""
+    provenance: Mapping[str, Any] | None = None
+    """Command, versions and machine; left out of a run's ``meta.json``."""
+
+
+@dataclass(frozen=True)
 class DatasetRecord:
     """Environment and scale of a dataset, and how it was made."""
 
@@ -151,6 +166,8 @@ class DatasetRecord:
     collect: CollectRecord | None
     relabel: RelabelRecord | None
     """None: its rewards are no ZeST scores."""
+    given: GivenRecord | None
+    """None: nobody gave its rewards."""
     fps: float | None
     """Steps per second of the recording that it was imported from, if known."""
 
@@ -166,12 +183,13 @@ class DatasetRecord:
             for stage, record in stages.items():
                 if not isinstance(record, Mapping):
                     raise TypeError(f"{stage} must be an object, got {record!r:.80}")
-            collect, relabel = stages.get("collect"), stages.get("relabel")
+            collect, relabel, given = (stages.get(stage) for stage in ("collect", "relabel", "given"))
             made = {
                 "id": dataset_id,
                 **{name: metadata.get(name) for name in ("env_spec", "ref_min_score", "ref_max_score")},
                 "collect": CollectRecord(**field_values(CollectRecord, collect)) if collect else None,
                 "relabel": RelabelRecord.from_json(relabel) if relabel else None,
+                "given": GivenRecord(**field_values(GivenRecord, given)) if given else None,
                 "fps": stages.get("recorded", {}).get("fps"),
             }
             read = cls(**field_values(cls, made))
@@ -218,9 +236,15 @@ class DatasetRecord:
         return env if isinstance(env, str) and is_maker(env) else None
 
     @property
+    def has_recorded_rewards(self) -> bool:
+        """Whether its rewards are those that it was recorded with."""
+        return self.relabel is None and self.given is None
+
+    @property
     def source_id(self) -> str:
-        """Id of the dataset that it was relabeled from; its own where it was not."""
-        return self.id if self.relabel is None else self.relabel.source
+        """Id of the dataset whose rewards were replaced; its own where they were not."""
+        made = self.relabel or self.given
+        return self.id if made is None else made.source
 
     @property
     def is_foreign(self) -> bool:

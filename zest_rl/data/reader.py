@@ -195,7 +195,7 @@ class Dataset:
 
     def _own_rewards(self) -> list[FloatArray] | None:
         """Read the rewards (T,) that were not made here; None without any, or where some are no finite numbers."""
-        name = "rewards" if self.record.relabel is None else SOURCE_REWARD
+        name = "rewards" if self.record.has_recorded_rewards else SOURCE_REWARD
         if not all(name in group for group in self.groups.values()):
             return None
         own = [rewards for rewards in self.rewards_to_keep() if rewards is not None and np.isfinite(rewards).all()]

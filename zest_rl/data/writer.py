@@ -336,9 +336,9 @@ def _build_scored(trajectories: Trajectories, folder: Path, scored: Sequence[Map
                 group[name] = array
 
 
-def _scored(reward: FloatArray, score: FloatArray, source: FloatArray | None) -> dict[str, FloatArray]:
+def _scored(reward: FloatArray, score: FloatArray | None, source: FloatArray | None) -> dict[str, FloatArray]:
     """Return the new arrays of an episode by their names on disk."""
-    arrays = {"rewards": reward, "infos/zest/score": score}
+    arrays = {"rewards": reward} | ({} if score is None else {"infos/zest/score": score})
     if source is not None and not np.isnan(source).all():
         arrays[SOURCE_REWARD] = np.concatenate([np.zeros(1, np.float32), source])
     return arrays
@@ -348,11 +348,11 @@ def write_scored(
     trajectories: Trajectories,
     dataset_id: str,
     rewards: Sequence[FloatArray],
-    scores: Sequence[FloatArray],
+    scores: Sequence[FloatArray] | None,
     *,
     description: str,
     zest: Mapping[str, Any],
-    extra: Callable[[Path], None],
+    extra: Callable[[Path], None] = lambda folder: None,
 ) -> Path:
     """Write episodes with new rewards; everything else, ground truth included, stays the same bit for bit.
 
@@ -362,9 +362,9 @@ def write_scored(
         trajectories: the episodes.
         dataset_id: the new id; must not exist.
         rewards: (T,) float32 per episode.
-        scores: (T+1,) float32 per episode, kept as ``infos/zest/score``.
+        scores: (T+1,) float32 per episode, kept as ``infos/zest/score``; None without any.
         description: appended to the source's description.
-        zest: provenance, kept in the metadata beside the source's own.
+        zest: record of the stage that made the rewards, kept in the metadata beside those of earlier stages.
         extra: called with the staged folder, to write further files to it.
 
     Returns:
@@ -375,19 +375,24 @@ def write_scored(
         ZestError: the disk is full or read-only; nothing is left behind.
     """
     n_steps = list(trajectories.n_steps)
-    if [len(r) for r in rewards] != n_steps or [len(s) for s in scores] != [n + 1 for n in n_steps]:
+    arrays = [(rewards, 0)] if scores is None else [(rewards, 0), (scores, 1)]
+    if any([len(array) - n_more for array in of_episodes] != n_steps for of_episodes, n_more in arrays):
         raise BadInput("rewards must have length T and scores length T+1 for every episode of the source dataset")
-    if not all(np.isfinite(array).all() for array in (*rewards, *scores)):
+    if not all(np.isfinite(array).all() for of_episodes, _ in arrays for array in of_episodes):
         raise BadInput("rewards and scores must be finite, got NaN or infinity")
     with _staged(dataset_id, 2 * trajectories.n_bytes) as staging:
-        scored = [_scored(*new) for new in zip(rewards, scores, trajectories.rewards_to_keep(), strict=True)]
+        kept, of_frames = trajectories.rewards_to_keep(), scores or (None,) * len(rewards)
+        scored = [_scored(*new) for new in zip(rewards, of_frames, kept, strict=True)]
         write_in_child("the dataset", _build_scored, trajectories, staging, scored)
         metadata = artifacts.read_json(staging / METADATA_FILE)
+        earlier = metadata.get("zest", {})
+        for stage in ("relabel", "given"):  # the rewards of before
+            earlier.pop(stage, None)
         _set_metadata(
             staging / METADATA_FILE,
             dataset_id=dataset_id,
             description=f"{metadata.get('description', '')} {description}".strip(),
-            zest={**metadata.get("zest", {}), **zest},
+            zest={**earlier, **zest},
         )
         extra(staging)
         _seal(staging, dataset_id, ({**old, **new} for old, new in zip(trajectories.written(), scored, strict=True)))

@@ -216,12 +216,17 @@ def evaluate(
     environment = find_environment(policy.meta, env=config.env, horizon=config.horizon, success_key=config.success_key)
     scored = score or uses_online_scores(policy, config.rtg)
     if scored and not (run / SCORER_FILE).exists():
-        reason = (
-            "its frames are from elsewhere, so scores cannot be made online; use --rtg schedule or constant (recorded "
-            "states, relabeled without --frames and --camera, could be scored)"
-            if dataset.is_foreign
-            else "it was not trained on a relabeled dataset; use --rtg constant, or train on what `zest relabel` writes"
-        )
+        reason = "it was not trained on a relabeled dataset; use --rtg constant, or train on what `zest relabel` writes"
+        if dataset.is_foreign:
+            reason = (
+                "its frames are from elsewhere, so scores cannot be made online; use --rtg schedule or constant "
+                "(recorded states, relabeled without --frames and --camera, could be scored)"
+            )
+        if dataset.given is not None:
+            reason = (
+                f"its rewards ({dataset.given.label}) were given as numbers, and new states have none; use --rtg "
+                "schedule or constant, or act with zest_rl.load_policy and your own rewards"
+            )
         raise BadInput(f"scores are needed, but {run.name} has no {SCORER_FILE}: {reason}")
     if scored:
         check_scorer(run / SCORER_FILE, trust=trust)

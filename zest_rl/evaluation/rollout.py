@@ -26,7 +26,7 @@ Traces = dict[str, NDArray[Any]]
 
 def uses_online_scores(policy: Policy, rtg: Rtg) -> bool:
     """Whether each new state must be scored while the policy acts."""
-    return policy.uses_return and rtg == "online" and _record(policy).relabel is not None
+    return policy.uses_return and rtg == "online" and not _record(policy).has_recorded_rewards
 
 
 def run_episodes(
@@ -60,7 +60,8 @@ def run_episodes(
     """
     if scorer is None and uses_online_scores(policy, rtg):
         raise BadInput(
-            "the policy was trained on ZeST scores, so rtg 'online' needs a scorer; give it, or use 'constant'"
+            "the policy was not trained on rewards of the environment, so rtg 'online' needs a scorer; give it, or use "
+            "'constant'"
         )
     relabel = _record(policy).relabel
     environment = find_environment(policy.meta) if environment is None else environment

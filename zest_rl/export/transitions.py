@@ -129,8 +129,8 @@ def read_transitions(ds: Dataset, shape: Shape = "step", normalise: bool = False
         scores = ds.scores()
         before = [float(score[0]) for score in scores]
         columns["zest_score"] = [score[1:] for score in scores]
-        if (source := ds.source_rewards()) is not None:
-            columns["source_reward"] = source
+    if (source := ds.source_rewards()) is not None:
+        columns["source_reward"] = source
     if ds.is_hand_rewarded:
         truth = ds.truth()
         columns["gt_reward"] = [episode.rewards for episode in truth]

@@ -92,8 +92,12 @@ def _short_name(meta: dict[str, Any]) -> str:
     if meta["agent"] == FOREIGN:
         return str(meta["name"])
     agent, dataset = str(meta["agent"]).upper(), DatasetRecord.of_run(meta)
+    if agent == "BC":
+        return agent
+    if dataset.relabel is not None:
+        return f"{agent} on {goal_name(dataset.relabel)}"
     own = "ground truth" if dataset.task is not None else "its own rewards"
-    return agent if agent == "BC" else f"{agent} on {own if dataset.relabel is None else goal_name(dataset.relabel)}"
+    return f"{agent} on {own if dataset.given is None else dataset.given.label}"
 
 
 def latest_evaluation(run: Path) -> Evaluation:

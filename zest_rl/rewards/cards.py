@@ -62,12 +62,13 @@ licences of their own.
 def policy_card(meta: Mapping[str, Any]) -> str:
     """Describe the policy of a run from its ``meta.json``."""
     dataset = DatasetRecord.of_run(meta)
-    relabel = dataset.relabel
+    relabel, given = dataset.relabel, dataset.given
+    own = "the dataset's own" if given is None else f"{given.label}, given as numbers for {given.source}"
     n_updates, n_params = meta["n_updates"], meta.get("n_params")
     rows = {
         "algorithm": meta["agent"] if n_params is None else f"{meta['agent']}, {n_params} parameters",
         "trained on": f"{dataset.id}, sha256 of the data `{meta['data_sha256']}`",
-        **({"rewards": "the dataset's own"} if relabel is None else _scorer_rows(relabel)),
+        **({"rewards": own} if relabel is None else _scorer_rows(relabel)),
         **({} if n_updates is None else {"updates": str(n_updates)}),
         "seed": str(meta["seed"]),
         **({"weights": f"sha256 `{meta['model_sha256']}`"} if "model_sha256" in meta else {}),
