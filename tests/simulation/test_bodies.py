@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from zest_rl.errors import BadInput
+from zest_rl.errors import BadInput, Notice
 from zest_rl.simulation.bodies import Bodies, body_name, joint_travel, moved_body, robot_bodies
 
 TWO_BLOCKS = """
@@ -120,6 +120,15 @@ def test_a_free_and_a_ball_joint_move_by_where_they_get() -> None:
 def test_what_cannot_be_told_is_asked(blocks: mujoco.MjModel, travel: list[float], message: str) -> None:
     with pytest.raises(BadInput, match=message):
         moved_body(blocks, np.array(travel), robot_bodies(blocks))
+
+
+def test_an_only_object_that_never_moves_is_told(blocks: mujoco.MjModel) -> None:
+    others = robot_bodies(blocks)
+    others[blocks.body("dial").id] = True
+    with pytest.warns(
+        Notice, match=r"drawer is looked at, the only object, but no recorded episode moves it by 0.001 m"
+    ):
+        assert body_name(blocks, moved_body(blocks, np.zeros(4), others)) == "drawer"
 
 
 def test_without_an_unactuated_joint_there_is_no_object() -> None:

@@ -7,6 +7,7 @@ of a task: it is the same whether the door was to be opened or closed, and no re
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
@@ -14,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.errors import BadInput, nearest
+from zest_rl.errors import BadInput, Notice, nearest
 
 Bodies = NDArray[np.bool_]
 """(nbody,) whether each body of a model belongs to a set."""
@@ -130,7 +131,7 @@ def moved_body(model: mujoco.MjModel, travel: NDArray[np.float64], robot: Bodies
     Args:
         model: of the states.
         travel: (njnt,) metres that each joint moves on average, see `joint_travel`.
-        robot: what is no object.
+        robot: what is no object; a `Notice` tells if the only object never moves.
 
     Raises:
         BadInput: nothing outside the robot has a joint, none of it moves, or two move alike.
@@ -147,7 +148,14 @@ def moved_body(model: mujoco.MjModel, travel: NDArray[np.float64], robot: Bodies
         by_body[body] = max(by_body.get(body, 0.0), float(travel[joint]))
     names = ", ".join(f"{body_name(model, body)} {far:.3f} m" for body, far in by_body.items())
     best = max(by_body, key=lambda body: by_body[body])
-    if len(by_body) > 1 and by_body[best] < _STILL:
+    if len(by_body) == 1 and by_body[best] < _STILL:
+        warnings.warn(
+            f"{body_name(model, best)} is looked at, the only object, but no recorded episode moves it by {_STILL:g} "
+            f"m, so frames show no change; {_INSTEAD}",
+            Notice,
+            stacklevel=2,
+        )
+    elif by_body[best] < _STILL:
         raise BadInput(
             f"the object is what moves most in the recorded episodes, but nothing moves by {_STILL:g} m ({names}); "
             + _INSTEAD

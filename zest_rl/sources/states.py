@@ -42,7 +42,7 @@ class States:
     episodes: tuple[str, ...]
     """Groups of the episodes."""
     env_spec: str
-    """Of the environment, as JSON, checked."""
+    """Of the environment, as JSON, checked; or ``package.module:make``."""
     qpos: Columns
     """Empty: a plugin rebuilds it (`state_plugins`)."""
     scenery: tuple[str, ...]
