@@ -133,7 +133,9 @@ def test_a_picture_in_memory_is_seen_as_the_same_picture_in_a_file(folder: Path,
 def test_a_curve_is_drawn_written_and_shown_in_notebooks(folder: Path) -> None:
     mpl.use("agg")
     curve = zest_rl.score("film.mp4", start="closed.png", goal="open.png")
-    assert re.fullmatch(r"Curve of film.mp4: 6 scores from 0.000 to 0.9\d\d, highest 0.9\d\d at 1.25 s", repr(curve))
+    assert re.fullmatch(
+        r"Curve of film.mp4: 6 scores, first 0.000, last 0.9\d\d, highest 0.9\d\d at 1.25 s", repr(curve)
+    )
     ax = curve.plot()
     np.testing.assert_array_equal(ax.lines[0].get_xydata(), np.stack([curve.times, curve.scores], axis=1))
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("time, s", "ZeST score")

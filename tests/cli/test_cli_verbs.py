@@ -55,6 +55,8 @@ def test_each_verb_ends_with_the_next_command_and_that_command_works(
     assert reported["report"] == "report.html"
     assert reported["rows"].keys() == {"Demo", "BC"}
     assert reported["rows"]["BC"] == round(evaluated["normalized_return"]["value"], 2)
+    assert reported["unit"] == "% of the expert"
+    assert reported["sentence"].startswith("BC reaches")
     assert "BC" in Path("report.html").read_text(encoding="utf-8")
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from recorded_robots import record
 
+from zest_rl.cli.report import summary
 from zest_rl.runtime import artifacts
 
 Run = Callable[..., dict[str, Any]]
@@ -55,6 +56,9 @@ def test_an_environment_goes_from_a_recording_to_a_report(env_id: str, zest: Run
     reported = zest("report", trained["run"], "--output", tmp_path / "report.html")
     assert reported["rows"].keys() == {"Demo", "RVS on episode:0"}
     assert np.isfinite(list(reported["rows"].values())).all()
+    assert (reported["success"]["RVS on episode:0"] is None) == (env_id == "Hopper-v5")
+    assert "return" in summary(reported)
+    assert "of the expert" not in summary(reported), "there are no references"
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "Returns are sums of the environment's own rewards" in page
     assert "ormalized return" not in page

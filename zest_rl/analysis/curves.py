@@ -76,7 +76,7 @@ class Curve:
         best = int(self.scores.argmax())
         when = f"{self.times[best]:.4g} s" if self.unit == "s" else f"step {self.times[best]:g}"
         return (
-            f"Curve of {self.film}: {len(self)} scores from {self.scores[0]:.3f} to {self.scores[-1]:.3f}, "
+            f"Curve of {self.film}: {len(self)} scores, first {self.scores[0]:.3f}, last {self.scores[-1]:.3f}, "
             f"highest {self.scores[best]:.3f} at {when}"
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,8 @@ from typing import Annotated, Any
 import tyro
 
 from zest_rl.cli.ui import Ui
+
+PERCENT = "% of the expert"
 
 
 @dataclass(frozen=True)
@@ -33,15 +36,26 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     from zest_rl.report.sections import RESULTS
 
     report = compare_runs(config.runs, title=config.title, trust=config.trust)
-    path = write_report(report, config.output)
+    path, rows = write_report(report, config.output), report.items(RESULTS)
     return {
         "report": str(path),
-        "rows": {row.method: round(row.mean, 2) for row in report.items(RESULTS)},
+        "rows": {row.method: round(row.mean, 2) for row in rows},
+        "intervals": {row.method: [round(row.ci_low, 2), round(row.ci_high, 2)] for row in rows},
+        "success": {row.method: None if math.isnan(row.success_rate) else round(row.success_rate, 4) for row in rows},
+        "unit": PERCENT if all(row.is_normalized for row in rows) else "return",
+        "sentence": report.summary,
         "next": f"open {path} in a browser",
     }
 
 
 def summary(result: Mapping[str, Any]) -> str:
-    """One line per row, as text."""
-    rows = [f"  {method:<28}{mean:>7.1f} % of the expert" for method, mean in result["rows"].items()]
-    return "\n".join([*rows, f"report: {result['report']}"])
+    """One line per row, and what they say, as text."""
+    digits = 1 if result["unit"] == PERCENT else 2
+    lines = [f"  {'':<28}{result['unit']:>16}  {'95 % interval':<18}  success"]
+    for method, mean in result["rows"].items():
+        low, high = (f"{end:.{digits}f}" for end in result["intervals"][method])
+        interval, success = f"[{low}, {high}]", result["success"][method]
+        lines.append(
+            f"  {method:<28}{mean:>16.{digits}f}  {interval:<18}{'–' if success is None else f'{success:.0%}':>9}"
+        )
+    return "\n".join([*lines, result["sentence"], f"report: {result['report']}"])
