@@ -61,9 +61,11 @@ def words_of(config: Any) -> list[str]:
     defaults = {field.name: field.default for field in dataclasses.fields(config)}
     for field, argument in arguments_of(type(config)).items():
         value = getattr(config, field)
-        if argument.is_flag and value != defaults[field]:
+        if value == defaults[field]:
+            continue
+        if argument.is_flag:
             words.append(f"--no-{hyphenated(field)}" if value is False else argument.name)
-        if value != defaults[field] and not isinstance(value, bool):
+        if not isinstance(value, bool):
             words += map(str, value if isinstance(value, tuple) else [value])
     return words
 

@@ -7,7 +7,7 @@ episode when these are levels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,10 +31,18 @@ def _check_pairs(what: str, scores: Sequence[NDArray[np.generic]], others: Seque
 
 
 def _mean_over_episodes(values: Sequence[float]) -> Estimate:
-    """Average over the episodes of which a figure is known; NaN if it is of none."""
+    """Average a figure over the episodes that have one; NaN if there are none."""
     array = np.array(values)
-    known = array[~np.isnan(array)]
-    return over_episodes(lambda i: float(known[i].mean()) if len(known) else float("nan"), len(known))
+    return over_episodes(lambda i: float(array[i].mean()) if len(array) else float("nan"), len(array))
+
+
+def _against_time(
+    scores: Sequence[FloatArray], figure: Callable[[FloatArray, NDArray[np.int_]], float], *, least: int
+) -> Estimate:
+    """Average a figure of score and step over the episodes of at least so many frames; of constant scores it is 0."""
+    _check_pairs("scores", scores, scores)
+    long = (score for score in scores if len(score) >= least)
+    return _mean_over_episodes([0.0 if np.ptp(s) == 0 else float(figure(s, np.arange(len(s)))) for s in long])
 
 
 def _mean_over_frames(shares: Values, scores: Sequence[NDArray[np.generic]]) -> Estimate:
@@ -56,13 +64,7 @@ def value_order(scores: Sequence[FloatArray]) -> Estimate:
     """
     from scipy import stats
 
-    def order(score: FloatArray) -> float:
-        if len(score) < 2:
-            return float("nan")
-        return 0.0 if np.ptp(score) == 0 else float(stats.spearmanr(score, np.arange(len(score))).statistic)
-
-    _check_pairs("scores", scores, scores)
-    return _mean_over_episodes([order(score) for score in scores])
+    return _against_time(scores, lambda score, time: stats.spearmanr(score, time).statistic, least=2)
 
 
 def share_explained_by_step(scores: Sequence[FloatArray]) -> Estimate:
@@ -101,14 +103,7 @@ def linear_trend_r2(scores: Sequence[FloatArray]) -> Estimate:
     Episodes whose scores are constant count as 0. Those of one or two steps, through which every line goes, are left
     out; NaN if there are no others.
     """
-
-    def r2(score: FloatArray) -> float:
-        if len(score) < 3:
-            return float("nan")
-        return 0.0 if np.ptp(score) == 0 else float(np.corrcoef(score, np.arange(len(score)))[0, 1] ** 2)
-
-    _check_pairs("scores", scores, scores)
-    return _mean_over_episodes([r2(score) for score in scores])
+    return _against_time(scores, lambda score, time: np.corrcoef(score, time)[0, 1] ** 2, least=3)
 
 
 def share_saturated(scores: Sequence[FloatArray]) -> Estimate:

@@ -36,6 +36,7 @@ from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_arrays, write_arrays
 from zest_rl.runtime.cache import cache_folder
 from zest_rl.runtime.files import check_file
+from zest_rl.runtime.hub import SCORER_FILE as SCORER_FILE
 from zest_rl.runtime.parallel import one_thread
 from zest_rl.runtime.records import from_json, reading_record
 from zest_rl.runtime.trust import check_trusted, remember
@@ -47,8 +48,6 @@ from zest_rl.types import FloatArray
 OTHER_DIRECTION = 0.1
 """Cosine of a change and the goal's below which they have nothing to do with each other; pictures of other scenes than
 the dataset's have such cosines, too, and then only the mean over views tells."""
-SCORER_FILE = "zest_scorer.safetensors"
-"""Name of a scorer's file in a dataset that it relabeled, and in the runs that were trained on it."""
 
 
 @dataclass(frozen=True)

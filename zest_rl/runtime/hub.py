@@ -16,6 +16,7 @@ from zest_rl.runtime.cache import cache_folder
 
 SCHEME = "hf://"
 SCORER_FILE = "zest_scorer.safetensors"
+"""Name of a scorer's file in a dataset that it relabeled, and in the runs that were trained on it."""
 RUN_FILES = ("meta.json", "model.safetensors", SCORER_FILE, "README.md")
 """What a run consists of on the hub; all that is fetched of one. Nothing in them runs."""
 _ADVICE = {
