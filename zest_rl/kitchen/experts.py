@@ -151,11 +151,16 @@ def make_expert(task_name: str, env: gymnasium.Env[Any, Any], manner: Manner | N
     """
     if task_name not in SKILLS:
         raise BadInput(f"there is no expert for task {task_name!r}; {nearest(task_name, SKILLS)}")
+    return _ScriptedExpert(kitchen_of(task_name, env), SKILLS[task_name], manner or Manner())
+
+
+def kitchen_of(task_name: str, env: gymnasium.Env[Any, Any]) -> KitchenEnv:
+    """Return the kitchen inside an environment; raises `BadInput` where it is none of this task."""
     kitchen = env.unwrapped
     if not isinstance(kitchen, KitchenEnv) or kitchen.task.name != task_name:
         got = kitchen.task.name if isinstance(kitchen, KitchenEnv) else type(kitchen).__name__
         raise BadInput(f"the expert of {task_name!r} needs a KitchenEnv made with task={task_name!r}, got {got!r}")
-    return _ScriptedExpert(kitchen, SKILLS[task_name], manner or Manner())
+    return kitchen
 
 
 def add_uniform_noise(action: FloatArray, level: float, rng: np.random.Generator) -> FloatArray:
@@ -189,7 +194,7 @@ class _ScriptedExpert:
         return action
 
 
-class _Joint:
+class Joint:
     """The task's joint: its position, and where points of the moving part are when it moves on."""
 
     def __init__(self, env: KitchenEnv) -> None:
@@ -235,7 +240,7 @@ class _BarDragger:
 
     def __init__(self, env: KitchenEnv, skill: BarDrag, error: Vector) -> None:
         self._env, self._skill = env, skill
-        self._arm, self._joint = Arm(env, skill.tip_offset), _Joint(env)
+        self._arm, self._joint = Arm(env, skill.tip_offset), Joint(env)
         self._bar_site = env.model.site(skill.site).id
         self._to_grip = np.array([0.0, 0.0, skill.grip_offset]) + error
 
@@ -268,7 +273,7 @@ class _Pusher:
 
     def __init__(self, env: KitchenEnv, skill: Push, error: Vector) -> None:
         self._env, self._skill, self._error = env, skill, error
-        self._arm, self._joint = Arm(env, skill.tip_offset), _Joint(env)
+        self._arm, self._joint = Arm(env, skill.tip_offset), Joint(env)
         self._site = env.model.site(skill.site).id
         self._rotation = gripper_rotation(0.0, skill.pitch)
 
@@ -303,7 +308,7 @@ class _DoorOpener:
 
     def __init__(self, env: KitchenEnv, skill: DragThenPush, error: Vector) -> None:
         self._env, self._skill = env, skill
-        self._arm, self._joint = Arm(env, skill.tip_offset), _Joint(env)
+        self._arm, self._joint = Arm(env, skill.tip_offset), Joint(env)
         self._bar_site = env.model.site(skill.drag.site).id
         self._dragger = _BarDragger(env, skill.drag, error)
 
