@@ -68,12 +68,14 @@ class ShapedKitchen(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatA
 def shaped_reward(progress: float, distance: float, action: FloatArray) -> float:
     """Return the progress and more for its beginning and its end, for nearness (m) to the contact, and for calm.
 
-    The term of the distance falls everywhere, since a hand far away must be led, and is steep near the contact.
+    The term of the distance falls everywhere, since a hand far away must be led, and is steep near the contact. It fades
+    as the part begins to move: a door that is ajar is best pushed from inside, away from its bar.
     """
     progress = min(max(progress, 0.0), 1.03)
     moved = 0.3 * (1.0 - np.exp(-progress / 0.05))
     done = 0.5 * (progress >= SUCCESS_PROGRESS)
-    near = 0.3 * (1.0 - np.tanh(distance / 0.1) - 1.5 * distance)
+    near = 1.0 - np.tanh(distance / 0.1) - 1.5 * distance
+    near = 0.3 * (1.0 + max(0.0, 1.0 - progress / 0.3) * (near - 1.0))
     calm = -0.02 * np.square(action[:ARM_DIM]).mean()
     return float(progress + moved + done + near + calm)
 
@@ -93,7 +95,10 @@ def measure(weights: Weights, task: str, starts: range) -> tuple[float, float]:
 
 
 def train(task: str, seed: int, n_steps: int, folder: Path) -> dict[str, Any]:
-    """Train an expert, write ``folder/TASK.safetensors``, and return the record that the file holds, too.
+    """Train an expert; write ``folder/TASK.safetensors`` whenever it is better than before, and last the record of it.
+
+    Returns:
+        The record, as in ``folder/TASK.json``.
 
     Raises:
         ZestError: stable-baselines3 is not installed.
@@ -118,6 +123,7 @@ def train(task: str, seed: int, n_steps: int, folder: Path) -> dict[str, Any]:
               file=sys.stderr, flush=True)  # fmt: skip
         if found > best:
             best, kept, kept_at = found, weights, step
+            artifacts.write_bytes(folder / f"{task}.safetensors", save(kept))
         solved = solved + 1 if found[0] == 1.0 else 0
         if solved == ENOUGH:
             break
@@ -135,7 +141,7 @@ def train(task: str, seed: int, n_steps: int, folder: Path) -> dict[str, Any]:
         "versions": {name: version(name) for name in ("stable-baselines3", "torch", "mujoco", "gymnasium", "numpy")},
         "revision": artifacts.git_revision(),
     }
-    artifacts.write_bytes(folder / f"{task}.safetensors", save(kept, {"record": json.dumps(record)}))
+    artifacts.write_json(folder / f"{task}.json", record)
     return record
 
 
