@@ -68,8 +68,8 @@ class ShapedKitchen(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatA
 def shaped_reward(progress: float, distance: float, action: FloatArray) -> float:
     """Return the progress and more for its beginning and its end, for nearness (m) to the contact, and for calm.
 
-    The term of the distance falls everywhere, since a hand far away must be led, and is steep near the contact. It fades
-    as the part begins to move: a door that is ajar is best pushed from inside, away from its bar.
+    The term of the distance falls everywhere, since a hand far away must be led, and is steep near the contact. It
+    fades as the part begins to move: a door that is ajar is best pushed from inside, away from its bar.
     """
     progress = min(max(progress, 0.0), 1.03)
     moved = 0.3 * (1.0 - np.exp(-progress / 0.05))
