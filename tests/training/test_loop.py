@@ -23,6 +23,7 @@ from zest_rl.agents.base import describe_data
 from zest_rl.agents.bc import BCConfig
 from zest_rl.agents.dt import DTConfig
 from zest_rl.agents.rvs import RvSConfig
+from zest_rl.agents.trex import TREXConfig
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.training import loop
 from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint, snapshot_folder
@@ -33,6 +34,7 @@ CONFIGS: dict[str, Any] = {
     "bc": BCConfig(hidden_size=16, n_layers=2, batch_size=16, warmup_updates=5, learning_rate=1e-3),
     "dt": DTConfig(context_len=4, hidden_size=16, n_layers=1, batch_size=8, warmup_updates=5, learning_rate=1e-3),
     "rvs": RvSConfig(hidden_size=16, n_layers=2, batch_size=16, warmup_updates=5, dropout=0.1, n_networks=2),
+    "trex": TREXConfig(hidden_size=16, batch_size=8, warmup_updates=5, learning_rate=1e-3, dropout=0.1, n_networks=2),
 }
 
 
@@ -147,8 +149,9 @@ def test_snapshots_are_the_policies_of_shorter_trainings(whole: Path, tmp_path: 
     assert [folder.name for folder in sorted((run / "snapshots").iterdir())] == ["update-000000012", "update-000000024"]
     snapshot, shorter = run / "snapshots" / "update-000000024", start(tmp_path / "shorter", whole.name, n_updates=24)
     assert (snapshot / "model.safetensors").read_bytes() == (shorter / "model.safetensors").read_bytes()
-    policy = load_policy(snapshot)
-    assert policy.meta["n_updates"] == 24
+    assert json.loads((snapshot / "meta.json").read_text())["n_updates"] == 24
+    if whole.name != "trex":  # a reward
+        load_policy(snapshot)
 
 
 def test_a_run_and_its_snapshots_carry_the_files_that_they_are_given(tmp_path: Path) -> None:

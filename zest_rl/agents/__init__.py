@@ -13,11 +13,11 @@ from typing import Any
 import safetensors.torch
 import torch
 
-from zest_rl.agents import bc, dt, foreign, rvs
+from zest_rl.agents import bc, dt, foreign, rvs, trex
 from zest_rl.agents.base import Agent, DataFacts, Policy
 from zest_rl.embedders import find_device
-from zest_rl.errors import BadInput, ZestError, nearest
-from zest_rl.runtime.artifacts import hash_bytes, read_json
+from zest_rl.errors import BadInput, nearest
+from zest_rl.runtime.artifacts import read_checked, read_json
 from zest_rl.runtime.hub import local_run
 from zest_rl.runtime.records import from_json, reading_record
 from zest_rl.runtime.trust import remember
@@ -28,6 +28,7 @@ AGENTS: dict[str, Agent[Any]] = {
     "bc": bc.AGENT,
     "dt": dt.AGENT,
     "rvs": rvs.AGENT,
+    "trex": trex.AGENT,
 }
 
 
@@ -71,15 +72,7 @@ def _load(run_dir: Path, meta: dict[str, Any], device: torch.device) -> Policy:
         config = from_json(agent.config, meta["config"])
         facts = from_json(DataFacts, {field.name: meta[field.name] for field in fields(DataFacts)})
     path = run_dir / "model.safetensors"
-    try:
-        weights = path.read_bytes()
-    except OSError as error:
-        raise ZestError(f"cannot read {path}: {error.strerror}; train again into a new folder") from error
-    if hash_bytes(weights) != sha256:
-        raise ZestError(
-            f"{path} is damaged: its sha256 is {hash_bytes(weights)}, meta.json says {sha256}; "
-            "restore it from a copy or train again into a new folder"
-        )
+    weights = read_checked(path, sha256, "restore it from a copy or train again into a new folder")
     with reading_record(run_dir / "meta.json"), torch.random.fork_rng(devices=[]):  # initial weights are replaced
         tensors = safetensors.torch.load(weights)
         with torch.device("meta"):  # makes no room yet

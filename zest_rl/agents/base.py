@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from zest_rl.data.observations import standardized
 from zest_rl.embedders import Precision, computes_bf16
 from zest_rl.errors import BadInput
 from zest_rl.types import Episode, FloatArray
@@ -18,11 +19,13 @@ from zest_rl.types import Episode, FloatArray
 Batch = dict[str, Tensor]
 T = TypeVar("T")
 Sampler = Callable[[np.random.Generator], Batch]
+Judge = Callable[[Sequence[nn.Module]], dict[str, float]]
+JUDGED = ("held_out_loss", "held_out_accuracy", "disagreement")
+"""What a `Judge` tells; the weights of the smallest loss are kept."""
 
-# The Decision Transformer's code divides by std + 1e-6: a joint that never moved in the data would become a huge number
-# once it moves. Hence a floor (rad or m, as the kitchen's observations) and a bound (in standard deviations).
 STD_FLOOR = 1e-3
-MAX_NORMALIZED = 10.0
+"""The Decision Transformer's code divides by std + 1e-6: a joint that never moved in the data would become a huge
+number once it moves. Hence a floor (rad or m, as the kitchen's observations), and the bound of `standardized`."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +63,8 @@ class DataFacts:
         })  # fmt: skip
 
     def normalize(self, obs: FloatArray) -> FloatArray:
-        """Return ``(obs - mean) / std`` clipped to ± `MAX_NORMALIZED`; obs and result (…, obs_dim) float32."""
-        mean, std = np.array(self.obs_mean, dtype=np.float32), np.array(self.obs_std, dtype=np.float32)
-        normalized: FloatArray = np.clip((obs - mean) / std, -MAX_NORMALIZED, MAX_NORMALIZED).astype(np.float32)
-        return normalized
+        """Return observations (…, obs_dim) as networks take them, float32 of the same shape: see `standardized`."""
+        return standardized(obs, self.obs_mean, self.obs_std)
 
 
 def returns_to_go(rewards: FloatArray) -> FloatArray:
@@ -300,6 +301,9 @@ class Agent(Generic[ConfigT]):
     """Scalar to minimise: an average over the batch's rows, or over the elements that are valid."""
     policy: Callable[[nn.Module, ConfigT, DataFacts, dict[str, Any], torch.device], Policy]
     """From a trained model (in eval mode, on the device) and the run's meta to a policy."""
+    judge: Callable[[ConfigT, DataFacts, Sequence[Episode]], Judge | None] = lambda config, facts, episodes: None
+    """From the data to a function that judges networks (in eval mode) by what is held out of training, as `JUDGED`;
+    None keeps the last weights."""
 
     def networks(self, config: ConfigT, facts: DataFacts) -> nn.Module:
         """Return the model: one network, or ``config.n_networks`` in a list."""

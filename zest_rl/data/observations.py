@@ -21,6 +21,15 @@ from zest_rl.data.picture_forms import ROWS, PictureForm, form_of
 from zest_rl.errors import BadInput, Notice
 from zest_rl.types import FloatArray
 
+MAX_STANDARDIZED = 10.0
+"""Standard deviations; so many a joint is away that moves for the first time after the data."""
+
+
+def standardized(obs: FloatArray, mean: Sequence[float], std: Sequence[float]) -> FloatArray:
+    """Return ``(obs - mean) / std`` clipped to ± `MAX_STANDARDIZED`; obs and result (…, obs_dim) float32."""
+    scaled = (obs - np.array(mean, dtype=np.float32)) / np.array(std, dtype=np.float32)
+    return np.clip(scaled, -MAX_STANDARDIZED, MAX_STANDARDIZED).astype(np.float32)
+
 
 def entries(node: h5py.Group | h5py.Dataset, prefix: str = "") -> dict[str, h5py.Dataset]:
     """Return all datasets at or below a node by their paths, sorted; the path of the node itself is ""."""

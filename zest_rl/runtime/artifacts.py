@@ -222,6 +222,21 @@ def read_json(path: Path) -> Any:
         raise ZestError(f"{path} cannot be read as JSON: {error}") from error
 
 
+def read_checked(path: Path, sha256: str, advice: str) -> bytes:
+    """Read a file whose hash is known.
+
+    Raises:
+        ZestError: it cannot be read, or is another one.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ZestError(f"cannot read {path}: {error.strerror}; {advice}") from error
+    if hash_bytes(data) != sha256:
+        raise ZestError(f"{path} is damaged: its sha256 is {hash_bytes(data)}, meta.json says {sha256}; {advice}")
+    return data
+
+
 @contextmanager
 def staged_folder(final: Path) -> Iterator[Path]:
     """Yield an empty staging folder beside `final`; on success it is renamed to `final`, on failure removed.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import operator
 import shutil
 from contextlib import suppress
@@ -13,6 +14,7 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
+from zest_rl.agents.base import Judge, networks_of
 from zest_rl.errors import ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.files import check_file
@@ -20,6 +22,7 @@ from zest_rl.runtime.records import reading_record
 
 N_CHECKPOINTS = 2
 _PARTS = ("model", "optimizer", "average", "generators")
+_BEST = "best.safetensors"
 _FILES = {"state.json", *(f"{part}.safetensors" for part in _PARTS)}
 
 
@@ -36,6 +39,10 @@ class TrainState:
     recent: list[tuple[float, float]] = field(default_factory=list)
     """(loss, gradient norm) since the last logged row."""
     seconds: float = 0.0
+    best: dict[str, Tensor] = field(default_factory=dict)
+    """`averaged_weights` of the smallest ``held_out_loss``; empty where nothing is held out."""
+    best_judged: dict[str, float] = field(default_factory=dict)
+    """``update``, and `zest_rl.agents.base.JUDGED`, of these."""
 
     @classmethod
     def start(cls, model: nn.Module, weight_decay: float, seed: int) -> TrainState:
@@ -60,6 +67,16 @@ class TrainState:
             for mean, parameter in zip(self.average.values(), params, strict=True):
                 mean.lerp_(parameter, 1 - decay)
 
+    def judge(self, judge: Judge) -> dict[str, float]:
+        """Judge the averaged weights, and keep them if they are the best so far."""
+        weights, model = self.averaged_weights(), copy.deepcopy(self.model).eval()
+        model.load_state_dict(weights)
+        judged = judge(networks_of(model))
+        if not self.best or judged["held_out_loss"] < self.best_judged["held_out_loss"]:
+            self.best = {name: tensor.clone() for name, tensor in weights.items()}
+            self.best_judged = {"update": self.update, **judged}
+        return judged
+
     def averaged_weights(self) -> dict[str, Tensor]:
         """Return the model's state dict on the CPU, with averages in place of the trained parameters."""
         return {name: tensor.cpu() for name, tensor in (self.model.state_dict() | self.average).items()}
@@ -83,11 +100,14 @@ def save_checkpoint(run_dir: Path, state: TrainState) -> None:
     with artifacts.staged_folder(folder) as staging:
         for name, tensors in parts.items():
             safetensors.torch.save_file(tensors, staging / f"{name}.safetensors")
+        if state.best:
+            safetensors.torch.save_file(state.best, staging / _BEST)
         progress = {
             "update": state.update,
             "seconds": state.seconds,
             "recent": state.recent,
             "sampler": state.rng.bit_generator.state,
+            "best_judged": state.best_judged,
         }
         artifacts.write_json(staging / "state.json", progress)
         manifest = {path.name: artifacts.hash_file(path) for path in sorted(staging.iterdir())}
@@ -145,6 +165,8 @@ def _restore(folder: Path, state: TrainState) -> None:
     state.update, state.seconds = operator.index(progress["update"]), float(progress["seconds"])
     state.recent = [(float(loss), float(norm)) for loss, norm in progress["recent"]]
     state.rng.bit_generator.state = progress["sampler"]
+    if (folder / _BEST).exists():
+        state.best, state.best_judged = safetensors.torch.load_file(folder / _BEST), progress["best_judged"]
 
 
 def _is_whole(path: Path, sha256: str) -> bool:
@@ -159,8 +181,8 @@ def _verify(folder: Path) -> None:
     bad = ["manifest.json"]
     with suppress(ZestError):
         manifest = artifacts.read_json(folder / "manifest.json")
-        if isinstance(manifest, dict) and set(manifest) == _FILES:
-            bad = [name for name in sorted(_FILES) if not _is_whole(folder / name, manifest[name])]
+        if isinstance(manifest, dict) and set(manifest) | {_BEST} == _FILES | {_BEST}:
+            bad = [name for name in sorted(manifest) if not _is_whole(folder / name, manifest[name])]
     if bad:
         raise ZestError(
             f"checkpoint {folder} is damaged: {', '.join(bad)} is not what was written; delete this folder and start "

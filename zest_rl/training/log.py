@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -21,16 +21,22 @@ COLUMNS = ("loss", "grad_norm", "learning_rate", "updates_per_s")
 class MetricsLog:
     """Appends rows to the log of a run; use it as a context manager."""
 
-    def __init__(self, run_dir: Path, n_done: int) -> None:
+    def __init__(self, run_dir: Path, n_done: int, more: Sequence[str] = ()) -> None:
         """Open the log, and drop the rows that a killed run logged after update `n_done`.
+
+        Args:
+            run_dir: the run's folder.
+            n_done: updates.
+            more: columns besides `COLUMNS`.
 
         Raises:
             BadInput: what is there is no log.
         """
-        path, header = run_dir / "metrics.csv", ",".join(("update", *COLUMNS))
+        self._columns = (*COLUMNS, *more)
+        path, header = run_dir / "metrics.csv", ",".join(("update", *self._columns))
         with reading_record(path, "delete it to go on without the rows before this update"):
             lines = path.read_text(encoding="utf-8").splitlines() if path.exists() and n_done else []
-            whole = [line for line in lines[1:] if line.count(",") == len(COLUMNS)]
+            whole = [line for line in lines[1:] if line.count(",") == len(self._columns)]
             kept = [line for line in whole if int(line.partition(",")[0]) <= n_done]
         artifacts.write_bytes(path, "".join(f"{line}\n" for line in (header, *kept)).encode())
         if not n_done:
@@ -40,11 +46,11 @@ class MetricsLog:
         self._rows = csv.writer(self._file, lineterminator="\n")
 
     def write(self, update: int, row: Mapping[str, float]) -> None:
-        """Append the values of `COLUMNS` at an update; they are on disk when this returns."""
-        self._rows.writerow([update, *(row[column] for column in COLUMNS)])
+        """Append the values of the columns at an update; they are on disk when this returns."""
+        self._rows.writerow([update, *(row[column] for column in self._columns)])
         self._file.flush()
         os.fsync(self._file.fileno())  # a checkpoint after this row must find it
-        for column in COLUMNS:
+        for column in self._columns:
             self._board.add_scalar(column, row[column], update)
 
     def __enter__(self) -> Self:

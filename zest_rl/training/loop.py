@@ -6,7 +6,8 @@ A run folder holds::
     metrics.csv, tb/    loss, gradient norm, learning rate, updates per second; tb/ is for TensorBoard
     checkpoints/        the last two states of an unfinished run, each with a sha256 manifest
     snapshots/          intermediate policies, if asked for: each has the two files below, which `zest evaluate` takes
-    model.safetensors   the weights to act with: the moving average of the trained ones
+    model.safetensors   the weights to act with: the moving average of the trained ones; where trajectories are held
+                        out (T-REX), that of the update which did best on them
     meta.json           everything needed to load and to trace them; written last, so its presence means "finished"
 
 A run that was killed and is started again with the same arguments ends with the same bits as an uninterrupted one (on
@@ -36,6 +37,7 @@ from torch import nn
 
 from zest_rl.agents import get_agent
 from zest_rl.agents.base import (
+    JUDGED,
     OptimizerConfig,
     autocast,
     check_fields,
@@ -126,6 +128,7 @@ def fit(
     device = _find_device(config.device)
     facts = describe_data(episodes)
     sample = definition.sampler(agent_config, facts, episodes)
+    judge = definition.judge(agent_config, facts, episodes)
     launched().share(sample(np.random.default_rng(config.seed)))  # a batch that is too small is refused first
     precision = resolve_precision(agent_config.amp, device)
     request: dict[str, Any] = {
@@ -141,7 +144,7 @@ def fit(
     }
     if launched().size > 1:
         request["n_processes"] = launched().size
-    clashing = sorted(meta.keys() & {*request, *asdict(facts), *RESULT_KEYS})
+    clashing = sorted(meta.keys() & {*request, *asdict(facts), *RESULT_KEYS, "held_out"})
     if clashing:
         raise BadInput(f"meta must not use the keys {', '.join(clashing)}, which meta.json has already; rename them")
     request |= meta
@@ -163,7 +166,8 @@ def fit(
         networks = networks_of(state.model)
         n_reported, row_update = 0, state.update
         tick = row_tick = time.perf_counter()
-        with MetricsLog(run_dir, state.update) if group.leads else nullcontext() as log:
+        judged_columns = () if judge is None else JUDGED
+        with MetricsLog(run_dir, state.update, judged_columns) if group.leads else nullcontext() as log:
             while state.update < config.n_updates:
                 # sample
                 rows, weight = group.share(sample(state.rng))
@@ -204,6 +208,8 @@ def fit(
                         "updates_per_s": round((state.update - row_update) / (now - row_tick), 2),
                     }
                     state.recent, row_update, row_tick = [], state.update, now
+                    if judge is not None:
+                        row |= state.judge(judge)
                     if log is not None:
                         log.write(state.update, row)
                     if on_progress is not None:
@@ -336,9 +342,10 @@ def _write_snapshot(run_dir: Path, state: TrainState, described: dict[str, Any],
 
 def _write_policy(folder: Path, state: TrainState, described: dict[str, Any], files: Mapping[str, bytes]) -> None:
     """Write the weights and `files`, then ``meta.json``."""
-    weights = safetensors.torch.save(state.averaged_weights())
+    weights = safetensors.torch.save(state.best or state.averaged_weights())
     for name, content in {**files, "model.safetensors": weights}.items():
         artifacts.write_bytes(folder / name, content)
     n_params = sum(p.numel() for p in state.params.values())
     results = (n_params, artifacts.hash_bytes(weights), round(state.seconds, 3), artifacts.provenance())
-    artifacts.write_json(folder / "meta.json", described | dict(zip(RESULT_KEYS, results, strict=True)))
+    held_out = {"held_out": state.best_judged} if state.best else {}
+    artifacts.write_json(folder / "meta.json", described | dict(zip(RESULT_KEYS, results, strict=True)) | held_out)
