@@ -112,7 +112,7 @@ def test_the_kept_weights_are_those_of_the_smallest_loss_on_held_out_trajectorie
     [
         (walks(1), r"at least 2 trajectories that rank differently, but the 1 of this dataset have the same return"),
         ([*walks(1), *walks(1)], r"but the 2 of this dataset have the same return; relabel it with a goal"),
-        (walks(3), r"to train on and 2 to hold out, but got 1 and 2 of 3 returns in all; collect more, or set --held-out 0"),
+        (walks(3), r"to train on and 2 to hold out, but got 1 and 2 of 3 returns in all; collect more"),
     ],
 )
 def test_trajectories_that_cannot_be_ranked_are_refused(episodes: list[Episode], message: str, tmp_path: Path) -> None:
