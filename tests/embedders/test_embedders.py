@@ -21,6 +21,7 @@ from timm.data.transforms_factory import create_transform
 from zest_rl.data.images import list_images, read_image
 from zest_rl.embedders import load_embedder
 from zest_rl.embedders.checkpoints import installed_weights
+from zest_rl.embedders.networks import build_lite0
 from zest_rl.errors import BadInput, ZestError
 
 DRAWINGS = Path(__file__).parents[2] / "datasets" / "goals" / "micro"
@@ -117,6 +118,25 @@ def test_the_default_follows_timm_preprocessing_and_network(frames: list[np.ndar
     module.reset_classifier(0)
     preprocess = create_transform(**resolve_model_data_config(module))
     np.testing.assert_allclose(ours, by_library(module, preprocess, frames), atol=1e-4)
+
+
+@pytest.mark.parametrize("side", [1, 64, 224, 256, 301])
+def test_squares_are_preprocessed_at_once_as_pillow_does_to_the_bit(side: int) -> None:
+    rng = np.random.default_rng(side)
+    noise = rng.integers(0, 256, (2, side, side, 3), dtype=np.uint8)
+    squares = np.concatenate([noise, 255 * (noise > 127).astype(np.uint8)])  # whose edges leave 0 … 255 in between
+    network = build_lite0(installed_weights())
+    one_by_one = torch.stack([network.preprocess(Image.fromarray(square)) for square in squares])
+    assert network.preprocess_squares is not None
+    assert torch.equal(network.preprocess_squares(torch.from_numpy(squares)), one_by_one)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+def test_a_gpu_embeds_in_fp32_as_the_cpu_does(frames: list[np.ndarray]) -> None:
+    squares = [np.ascontiguousarray(frame[:100, :100]) for frame in frames]
+    for pictures in (frames, squares):
+        ours, theirs = (load_embedder("efficientnet-lite0", device=d).embed_images(pictures) for d in ("cuda", "cpu"))
+        assert (np.linalg.norm(ours - theirs, axis=1) <= 1e-5 * np.linalg.norm(theirs, axis=1)).all()
 
 
 def test_bf16_keeps_the_direction_of_the_default_to_a_percent(frames: list[np.ndarray]) -> None:

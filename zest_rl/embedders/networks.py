@@ -6,7 +6,7 @@ import difflib
 import importlib.metadata
 from collections.abc import Iterable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from zest_rl.embedders import checkpoints, hugging_face
 from zest_rl.embedders.base import ENTRY_POINTS, Network, Preprocess
+from zest_rl.embedders.resizing import preprocess_squares
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime.files import user_path
 
@@ -97,7 +98,9 @@ def build_lite0(weights: Path) -> Network:
     module.reset_classifier(0)  # type: ignore[operator]
     _fold_batch_norms(module.eval())
     _pad_in_convolutions(module)
-    return Network(module, create_transform(**checkpoints.LITE0_PREPROCESSING), module)
+    options = checkpoints.LITE0_PREPROCESSING
+    on_gpu = partial(preprocess_squares, options=options)
+    return Network(module, create_transform(**options), module, preprocess_squares=on_gpu)
 
 
 def _fold_batch_norms(module: nn.Module) -> None:

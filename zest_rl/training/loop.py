@@ -38,9 +38,7 @@ from torch import nn
 from zest_rl.agents import get_agent
 from zest_rl.agents.base import (
     JUDGED,
-    Agent,
     OptimizerConfig,
-    Rules,
     autocast,
     check_fields,
     describe_data,
@@ -51,16 +49,18 @@ from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint, snapshot_folder
 from zest_rl.training.distributed import Group, launched, local_index, process_group
-from zest_rl.training.log import COLUMNS, MetricsLog
+from zest_rl.training.log import MetricsLog
 from zest_rl.types import Episode
 
 RESULT_KEYS = ("n_params", "model_sha256", "train_seconds", "made_by")  # keys of meta.json that are known at the end
 
 
 @dataclass(frozen=True)
-class RunConfig:
-    """Where a policy is trained, and what of it is kept."""
+class TrainingConfig:
+    """How long and where a policy is trained; each algorithm has its own config besides."""
 
+    n_updates: int = 5000
+    """Gradient steps."""
     seed: int = 0
     """Of weights, batches and dropout."""
     device: str = "auto"
@@ -75,29 +75,14 @@ class RunConfig:
     """Updates between policies kept in RUN/snapshots, which `zest evaluate` takes too; default none."""
 
     def __post_init__(self) -> None:
-        check_fields("training", self, self.rules())
-
-    def rules(self) -> Rules:
-        """Return the rules of the fields."""
-        return {
+        check_fields("training", self, {
             "seed": (self.seed >= 0, "0 or positive"),
+            "n_updates": (self.n_updates >= 1, "at least 1"),
             "threads": (self.threads is None or self.threads >= 1, "at least 1, or None"),
             "checkpoint_every": (self.checkpoint_every >= 1, "at least 1"),
             "log_every": (self.log_every >= 1, "at least 1"),
             "snapshot_every": (self.snapshot_every is None or self.snapshot_every >= 1, "at least 1, or None"),
-        }
-
-
-@dataclass(frozen=True)
-class TrainingConfig(RunConfig):
-    """How long and where a policy is trained on a dataset; each algorithm has its own config besides."""
-
-    n_updates: int = 5000
-    """Gradient steps."""
-
-    def rules(self) -> Rules:
-        """Return the rules of the fields."""
-        return {**super().rules(), "n_updates": (self.n_updates >= 1, "at least 1")}
+        })  # fmt: skip
 
 
 class OnProgress(Protocol):
@@ -138,11 +123,9 @@ def fit(
             of this training is gone.
     """
     definition = get_agent(agent)
-    if not isinstance(definition, Agent):
-        raise BadInput(f"{agent} learns in the environment, not from data alone; use zest_rl.online.runs.train")
     if not isinstance(agent_config, definition.config):
         raise BadInput(f"agent {agent!r} takes a {definition.config.__name__}, got a {type(agent_config).__name__}")
-    device = training_device(config.device)
+    device = _find_device(config.device)
     facts = describe_data(episodes)
     sample = definition.sampler(agent_config, facts, episodes)
     judge = definition.judge(agent_config, facts, episodes)
@@ -170,7 +153,7 @@ def fit(
     with (
         process_group(device) as group,
         _claimed(run_dir, request, group) as finished,
-        torch_set_up(config.seed, request["threads"], device),
+        _torch_set_up(config.seed, request["threads"], device),
     ):
         if finished:
             return run_dir
@@ -184,7 +167,7 @@ def fit(
         n_reported, row_update = 0, state.update
         tick = row_tick = time.perf_counter()
         judged_columns = () if judge is None else JUDGED
-        with MetricsLog(run_dir, state.update, (*COLUMNS, *judged_columns)) if group.leads else nullcontext() as log:
+        with MetricsLog(run_dir, state.update, judged_columns) if group.leads else nullcontext() as log:
             while state.update < config.n_updates:
                 # sample
                 rows, weight = group.share(sample(state.rng))
@@ -267,7 +250,7 @@ def _reseed_others(seed: int, group: Group, update: int) -> None:
 
 
 @contextmanager
-def torch_set_up(seed: int, threads: int, device: torch.device) -> Iterator[None]:
+def _torch_set_up(seed: int, threads: int, device: torch.device) -> Iterator[None]:
     """Seed torch and set its threads; restore both at the end."""
     before = torch.get_num_threads()
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
@@ -279,12 +262,7 @@ def torch_set_up(seed: int, threads: int, device: torch.device) -> Iterator[None
             torch.set_num_threads(before)
 
 
-def training_device(name: str) -> torch.device:
-    """Return the device of a `RunConfig`; under ``torchrun``, this process's GPU.
-
-    Raises:
-        BadInput: it is none, or not there.
-    """
+def _find_device(name: str) -> torch.device:
     kind, _, index = name.partition(":")
     if kind not in ("auto", "cpu", "cuda") or (index and not (kind == "cuda" and index.isdecimal())):
         raise BadInput(f"device must be auto, cpu, cuda or cuda:N, got {name!r}")
@@ -314,8 +292,8 @@ def _claimed(run_dir: Path, request: dict[str, Any], group: Group) -> Iterator[b
     """
     with artifacts.lock(run_dir) if group.leads else nullcontext():
         if group.leads:
-            check_request(run_dir, request)
-        group.agree(data_sha256=request["data_sha256"], precision=request["precision"])  # and wait for `check_request`
+            _check_request(run_dir, request)
+        group.agree(data_sha256=request["data_sha256"], precision=request["precision"])  # and wait for `_check_request`
         finished = (run_dir / "meta.json").exists()
         group.agree(finished=finished)
         yield finished
@@ -324,12 +302,8 @@ def _claimed(run_dir: Path, request: dict[str, Any], group: Group) -> Iterator[b
         group.agree()
 
 
-def check_request(run_dir: Path, request: dict[str, Any]) -> None:
-    """Write ``run.json``, or check that the existing one holds the same arguments.
-
-    Raises:
-        BadInput: it holds others, or the folder other files.
-    """
+def _check_request(run_dir: Path, request: dict[str, Any]) -> None:
+    """Write ``run.json``, or check that the existing one holds the same arguments."""
     path = run_dir / "run.json"
     if path.exists():
         defaults = _flat({"config": asdict(get_agent(request["agent"]).config())})  # of options newer than the run
