@@ -19,7 +19,7 @@ ROOT = PACKAGE.parent
 
 ROOMS = (
     "errors", "types", "runtime", "metrics", "data", "simulation", "kitchen", "sources", "embedders", "rewards",
-    "export", "agents", "training", "evaluation", "analysis", "report", "api", "cli",
+    "export", "agents", "training", "evaluation", "online", "analysis", "report", "api", "cli",
 )  # fmt: skip
 """The pipeline: a module imports only from its own room and from those before it."""
 
@@ -28,7 +28,20 @@ MAY_READ_GROUND_TRUTH = (
 )  # fmt: skip
 """The only callers of `Dataset.truth`, which make reports or copies: nothing that chooses or trains anything."""
 
-HEAVY = ("torch", "transformers", "mujoco", "minari", "timm", "open_clip", "gymnasium", "matplotlib", "scipy", "h5py")
+HEAVY = (
+    "stable_baselines3",
+    "sb3_contrib",
+    "torch",
+    "transformers",
+    "mujoco",
+    "minari",
+    "timm",
+    "open_clip",
+    "gymnasium",
+    "matplotlib",
+    "scipy",
+    "h5py",
+)
 
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 RECIPE_FOLDERS = ("datasets", "train", "eval")

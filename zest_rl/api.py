@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 from zest_rl.errors import BadInput, nearest
 
@@ -135,6 +135,38 @@ def inspect(
     return inspected
 
 
+class Trainer(NamedTuple):
+    """What trains an agent: `zest_rl.training.runs` from data alone, `zest_rl.online.runs` in the environment."""
+
+    train: Callable[..., Path]
+    config: type[Any]
+    """Of the training; the agent has one of its own."""
+    counts: str
+    """What is counted: updates or steps."""
+
+
+def trainer(agent: str) -> Trainer:
+    """Return what trains an agent.
+
+    Raises:
+        BadInput: there is no such agent.
+    """
+    from zest_rl.agents import Agent, get_agent
+    from zest_rl.training.loop import RunConfig, TrainingConfig
+
+    if isinstance(get_agent(agent), Agent):
+        from zest_rl.training.runs import train as train_on_data
+
+        return Trainer(train_on_data, TrainingConfig, "updates")
+
+    def train_online(*args: Any, **kwargs: Any) -> Path:
+        from zest_rl.online.runs import train  # brings a simulator, which help does without
+
+        return train(*args, **kwargs)
+
+    return Trainer(train_online, RunConfig, "steps")
+
+
 def train(
     agent: str,
     dataset: AnyDataset,
@@ -143,10 +175,12 @@ def train(
     on_progress: OnProgress | None = None,
     **flags: Any,
 ) -> Path:
-    """Train a policy, or go on with an interrupted run, and return its folder; see `zest_rl.training.runs.train`.
+    """Train a policy, or go on with an interrupted run, and return its folder.
+
+    See `zest_rl.training.runs.train`, and for sac, ppo and trpo `zest_rl.online.runs.train`.
 
     Args:
-        agent: bc, dt or rvs.
+        agent: bc, dt or rvs; sac, ppo or trpo, which learn in the dataset's environment.
         dataset: its rewards are the only information about quality.
         run_dir: folder of this run alone; default ``runs/DATASET-AGENT-seedN``.
         on_progress: called after every logged row.
@@ -154,12 +188,11 @@ def train(
             config (`zest_rl.agents.dt.DTConfig`, …).
     """
     from zest_rl.agents import get_agent
-    from zest_rl.training.loop import TrainingConfig
-    from zest_rl.training.runs import train as train_run
 
-    agent_config, config = _configs(flags, get_agent(agent).config, TrainingConfig)
+    how = trainer(agent)
+    agent_config, config = _configs(flags, get_agent(agent).config, how.config)
     folder = None if run_dir is None else Path(run_dir)
-    return train_run(agent, _id(dataset), agent_config, config, run_dir=folder, on_progress=on_progress)
+    return how.train(agent, _id(dataset), agent_config, config, run_dir=folder, on_progress=on_progress)
 
 
 def evaluate(

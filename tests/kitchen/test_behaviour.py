@@ -219,7 +219,7 @@ def test_a_return_leaves_out_the_reward_of_the_reset() -> None:
         ({"slow_max": 1.0}, r"slow_max must be in \[0, 0.9\], got 1.0"),
         ({"bias_max": -1.0}, r"bias_max must be in \[0, 1.0\], got -1.0"),
         ({"grip_max": 0.2}, r"grip_max must be in \[0, 0.1\], got 0.2"),
-        ({"policy": "export"}, "policy must be 'expert' or 'nothing', got 'export'"),
+        ({"policy": "export"}, "policy must be one of expert, rl, rl-mean, nothing, got 'export'"),
         ({"seed": -1}, "seed must be 0 or positive, got -1"),
     ],
 )

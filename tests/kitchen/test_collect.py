@@ -50,12 +50,12 @@ def zest(words: list[str]) -> tuple[int, dict[str, Any], str]:
     return code, json.loads(out.getvalue()), err.getvalue()
 
 
-def collect_into(folder: Path, patch: pytest.MonkeyPatch) -> dict[str, Any]:
+def collect_into(folder: Path, patch: pytest.MonkeyPatch, *more: str) -> dict[str, Any]:
     for module, name, value in SMALL:
         patch.setattr(f"{module}.{name}", value)
     patch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
     patch.setenv("ZEST_CACHE", str(folder / "cache"))
-    code, result, err = zest(WORDS)
+    code, result, err = zest([*WORDS, *more])
     assert code == 0, err
     return result
 
@@ -90,6 +90,21 @@ def test_the_command_tells_what_it_made(uncut: tuple[Path, dict[str, Any]], monk
     assert (metadata["ref_min_score"], metadata["ref_max_score"]) == (result["minimum_return"], result["expert_return"])
     assert metadata["zest"]["collect"]["asked"]["noise_max"] == 0.5
     assert not parts(folder / "cache")
+
+
+def test_a_dataset_of_an_expert_by_rl_says_so_and_one_of_a_script_is_recorded_as_ever(
+    uncut: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = collect_into(tmp_path, monkeypatch, "--expert", "rl", "--task", "sdoor")
+    metadata = read(made["dataset"], lambda ds: ds.metadata)
+    assert metadata["zest"]["collect"]["asked"]["expert"] == "rl"
+    assert metadata["algorithm_name"] == "imperfect randomized expert found by soft actor-critic"
+    assert "by a randomized expert found by soft actor-critic with noise_max 0.5 (" in metadata["description"]
+    assert made["expert_success"] == 1
+    code, refused, _ = zest([*WORDS, "--task", "sdoor"])
+    assert (code, "was collected with other arguments" in refused["error"]["message"]) == (2, True)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(uncut[0] / "minari"))
+    assert "expert" not in read(DATASET, lambda ds: ds.metadata)["zest"]["collect"]["asked"]
 
 
 def test_the_command_typed_again_does_nothing_and_refuses_other_arguments(

@@ -15,7 +15,7 @@ from safetensors.numpy import load_file
 
 from zest_rl.errors import BadInput
 from zest_rl.training.distributed import Group, launched
-from zest_rl.training.loop import _find_device
+from zest_rl.training.loop import training_device
 
 BIN = Path(sys.executable).parent
 SMALL = ["--hidden-size", "32", "--n-layers", "1", "--threads", "1", "--amp", "fp32", "--device", "cpu"]
@@ -141,10 +141,10 @@ def test_torchrun_gives_each_process_its_gpu(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert launched() == Group(rank=3, size=4)
     assert not launched().leads
-    assert _find_device("auto") == _find_device("cuda") == torch.device("cuda", 1)
-    assert _find_device("cpu") == torch.device("cpu")
+    assert training_device("auto") == training_device("cuda") == torch.device("cuda", 1)
+    assert training_device("cpu") == torch.device("cpu")
     with pytest.raises(BadInput, match="each process takes a GPU of its own, got device 'cuda:0'"):
-        _find_device("cuda:0")
+        training_device("cuda:0")
     monkeypatch.setenv("LOCAL_RANK", "2")
     with pytest.raises(BadInput, match=r"device cuda:2 is not there: 2 CUDA devices found; .* fewer processes"):
-        _find_device("cuda")
+        training_device("cuda")

@@ -13,7 +13,7 @@ from typing import Any
 import safetensors.torch
 import torch
 
-from zest_rl.agents import bc, dt, foreign, rvs, trex
+from zest_rl.agents import bc, dt, foreign, online, rvs, trex
 from zest_rl.agents.base import Agent, DataFacts, Policy
 from zest_rl.embedders import find_device
 from zest_rl.errors import BadInput, nearest
@@ -24,15 +24,18 @@ from zest_rl.runtime.trust import remember
 
 __all__ = ["AGENTS", "Agent", "Policy", "get_agent", "load_policy"]
 
-AGENTS: dict[str, Agent[Any]] = {
+AGENTS: dict[str, Agent[Any] | online.OnlineAgent] = {
     "bc": bc.AGENT,
     "dt": dt.AGENT,
     "rvs": rvs.AGENT,
     "trex": trex.AGENT,
+    "sac": online.SAC,
+    "ppo": online.PPO,
+    "trpo": online.TRPO,
 }
 
 
-def get_agent(name: str) -> Agent[Any]:
+def get_agent(name: str) -> Agent[Any] | online.OnlineAgent:
     """Return the agent called `name`.
 
     Raises:

@@ -9,13 +9,14 @@ from typing import Annotated, Any, ClassVar
 
 import tyro
 
+from zest_rl.api import trainer
 from zest_rl.cli.ui import SilentUi, Ui
 from zest_rl.training.distributed import launched
 
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """What is trained on; beside these, the fields of `TrainingConfig` and of the agent's config are flags."""
+    """What is trained on; beside these, the fields of the agent's config and of its trainer's are flags."""
 
     agent: ClassVar[str]
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
@@ -34,20 +35,17 @@ def __getattr__(name: str) -> Any:
 
 
 def _with_arguments(agent: str, agent_class: type[Any]) -> type[Any]:
-    from zest_rl.training.loop import TrainingConfig
-
     summary = f"Train {(agent_class.__doc__ or agent).splitlines()[0]}"
     members = {"agent": agent, "__doc__": summary, "__annotations__": {}, "__post_init__": split_config}
-    bases = (Arguments, TrainingConfig, agent_class)
+    bases = (Arguments, trainer(agent).config, agent_class)
     return dataclass(frozen=True, kw_only=True)(type(f"{agent_class.__name__}Arguments", bases, members))
 
 
 def split_config(config: Any) -> tuple[Any, Any]:
-    """Return the agent's config and the `TrainingConfig` that flags stand for; both check their values."""
+    """Return the agent's config and that of the training that flags stand for; both check their values."""
     from zest_rl.agents import AGENTS
-    from zest_rl.training.loop import TrainingConfig
 
-    parts = AGENTS[config.agent].config, TrainingConfig
+    parts = AGENTS[config.agent].config, trainer(config.agent).config
     agent_config, training = (part(**{f.name: getattr(config, f.name) for f in fields(part)}) for part in parts)
     return agent_config, training
 
@@ -57,18 +55,19 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
     from zest_rl.data.provenance import DatasetRecord
     from zest_rl.evaluation.environments import is_evaluable
     from zest_rl.runtime import artifacts
-    from zest_rl.training.runs import default_run_dir, train
+    from zest_rl.training.runs import default_run_dir
 
     ui = ui if launched().leads else SilentUi()
     agent_config, training = split_config(config)
     run_dir = config.run_dir or default_run_dir(config.agent, config.dataset, training.seed)
     ui.say(f"training in {run_dir}")
-    with ui.progress(f"{config.agent} updates", training.n_updates) as advance:
+    how = trainer(config.agent)
+    with ui.progress(f"{config.agent} {how.counts}", getattr(config, f"n_{how.counts}")) as advance:
 
         def show(n: int, **row: float) -> None:
-            advance(n, loss=row["loss"])
+            advance(n, **dict([*row.items()][:1]))  # the loss, or the reward
 
-        train(config.agent, config.dataset, agent_config, training, run_dir=run_dir, on_progress=show)
+        how.train(config.agent, config.dataset, agent_config, training, run_dir=run_dir, on_progress=show)
     if not launched().leads:
         return {}
     meta = artifacts.read_json(run_dir / "meta.json")

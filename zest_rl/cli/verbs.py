@@ -63,6 +63,16 @@ USAGES = {
         ("n_updates", "batch_size", "seed", "device", "run_dir"),
         ("zest/kitchen-micro-noisy-v0", "zest/kitchen-micro-noisy-v0 --n-updates 2000 --seed 1"),
     ),
+    **{
+        f"train {agent}": Usage(
+            ("n_steps", "reward", "from_scratch", "seed", "run_dir"),
+            (
+                "zest/kitchen-micro-noisy-zest-0a1b2c3d-v0",
+                f"zest/kitchen-micro-noisy-zest-0a1b2c3d-v0 --reward truth --n-steps {n_steps}",
+            ),
+        )
+        for agent, n_steps in (("sac", 5000), ("ppo", 10000), ("trpo", 10000))
+    },
     "adopt": Usage(
         ("dataset", "name", "run_dir"), ('torchscript:iql.pt --dataset zest/kitchen-micro-noisy-v0 --name "IQL, mine"',)
     ),

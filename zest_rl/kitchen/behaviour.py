@@ -2,7 +2,7 @@
 
 As in the paper the expert's actions get uniform noise whose level is drawn per trajectory: episode i acts with
 ``clip(expert + U(−s_i, s_i))``, ``s_i = u_i · noise_max``, ``u_i ~ U(0, 1)``. The other flaws, also drawn per
-trajectory, are fields of `Behaviour`.
+trajectory, are fields of `Behaviour`. The actions of an expert found by RL are sampled, too.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen.collect_config import LARGEST, check_flaws, check_n_episodes
 from zest_rl.kitchen.env import ACT_DIM, HORIZON, N_QVEL, OBS_DIM, env_spec
 from zest_rl.kitchen.experts import DONE_PROGRESS, Manner, add_uniform_noise, make_expert
+from zest_rl.kitchen.rl_expert import make_rl_expert, weights_file
 from zest_rl.kitchen.scene import N_QPOS
 from zest_rl.kitchen.tasks import get_task
 from zest_rl.runtime import artifacts
@@ -34,6 +35,7 @@ EPISODES_PER_JOB = 5
 _ARRAYS = ("obs", "actions", "qpos", "qvel", "gt_reward", "gt_success")  # of a `Recording`
 STOP_BETWEEN = (0.1, 1.0)
 _CODE = ("behaviour.py", "env.py", "arm.py", "experts.py", "tasks.py")  # with the behaviour, determines an episode
+POLICIES = ("expert", "rl", "rl-mean", "nothing")
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,8 @@ class Behaviour:
 
     task: str
     policy: str
-    """``"expert"``, or ``"nothing"``: the zero action, the lower reference of the normalized return."""
+    """``"expert"``: scripted; ``"rl"``: trained, its actions sampled; ``"rl-mean"``: trained, acting by its mean;
+    ``"nothing"``: the zero action, the lower reference of the normalized return."""
     noise_max: float = 0.0
     """Largest noise level; 1 is the whole action range to either side."""
     stop_share: float = 0.0
@@ -60,15 +63,15 @@ class Behaviour:
     def __post_init__(self) -> None:
         get_task(self.task)
         check_flaws({name: getattr(self, name) for name in LARGEST})
-        if self.policy not in ("expert", "nothing"):
-            raise BadInput(f"policy must be 'expert' or 'nothing', got {self.policy!r}")
+        if self.policy not in POLICIES:
+            raise BadInput(f"policy must be one of {', '.join(POLICIES)}, got {self.policy!r}")
         if self.seed < 0:
             raise BadInput(f"seed must be 0 or positive, got {self.seed}")
 
     def without_flaws(self) -> Behaviour:
-        """Return this behaviour, with the same starts, without flaws."""
+        """Return this behaviour, with the same starts, without flaws and with actions that are not sampled."""
         values: dict[str, Any] = dict.fromkeys(LARGEST, 0.0)
-        return replace(self, **values)
+        return replace(self, policy="rl-mean" if self.policy == "rl" else self.policy, **values)
 
     def with_value(self, flaw: str, value: float) -> Behaviour:
         """Return this behaviour with another value of one of `LARGEST`."""
@@ -83,7 +86,7 @@ def rollout(behaviour: Behaviour, index: int) -> Arrays:
     level = rng.uniform() * behaviour.noise_max
     manner, bias = draw_manner(behaviour, np.random.default_rng(manner_seed))
     env = gymnasium.make(env_spec(behaviour.task, behaviour.init_noise))
-    expert = make_expert(behaviour.task, env, manner)
+    act = _actor(behaviour, env, manner, bias, rng)
     steps: dict[str, list[Any]] = {name: [] for name in _ARRAYS}
 
     def record(obs: FloatArray, info: dict[str, Any]) -> None:
@@ -95,8 +98,7 @@ def rollout(behaviour: Behaviour, index: int) -> Arrays:
 
     record(*env.reset(seed=int(env_seed)))
     for _ in range(HORIZON):
-        action = expert.act() + bias if behaviour.policy == "expert" else np.zeros(ACT_DIM, np.float32)
-        steps["actions"].append(add_uniform_noise(action, level, rng))
+        steps["actions"].append(add_uniform_noise(act(), level, rng))
         obs, _, _, _, info = env.step(steps["actions"][-1])
         record(obs, info)
     env.close()
@@ -107,6 +109,19 @@ def rollout(behaviour: Behaviour, index: int) -> Arrays:
         "stop_at": np.array([manner.stop_at]),
         "speed": np.array([manner.speed]),
     }
+
+
+def _actor(
+    behaviour: Behaviour, env: gymnasium.Env[Any, Any], manner: Manner, bias: FloatArray, rng: np.random.Generator
+) -> Callable[[], FloatArray]:
+    """Return what acts on `env`, before noise; `rng` samples the actions of an expert that is randomized."""
+    if behaviour.policy == "nothing":
+        return lambda: np.zeros(ACT_DIM, np.float32)
+    if behaviour.policy == "expert":
+        expert = make_expert(behaviour.task, env, manner)
+    else:
+        expert = make_rl_expert(behaviour.task, env, rng if behaviour.policy == "rl" else None)
+    return lambda: expert.act() + bias
 
 
 def draw_manner(behaviour: Behaviour, rng: np.random.Generator) -> tuple[Manner, FloatArray]:
@@ -220,7 +235,10 @@ def remove_parts(behaviour: Behaviour) -> None:
 
 def behaviour_folder(behaviour: Behaviour) -> Path:
     """Where `run_behaviour` keeps finished parts."""
-    code = [artifacts.hash_file(Path(__file__).with_name(name)) for name in _CODE]
+    files = [Path(__file__).with_name(name) for name in _CODE]
+    if behaviour.policy.startswith("rl"):
+        files += [Path(__file__).with_name("rl_expert.py"), weights_file(behaviour.task)]
+    code = [artifacts.hash_file(path) for path in files]
     key = {**asdict(behaviour), "code": code, "versions": artifacts.versions()}
     return artifacts.cache_dir() / "episodes" / artifacts.hash_json(key)[:20]
 

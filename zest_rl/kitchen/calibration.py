@@ -50,17 +50,15 @@ def measure_references(
     Raises:
         ZestError: the expert does no better than the robot doing nothing.
     """
+    best = behaviour.without_flaws()
     runs = {
-        policy: run_behaviour(
-            replace(behaviour.without_flaws(), policy=policy),
-            n,
-            first=REFERENCE_STREAM,
-            n_workers=n_workers,
-            on_progress=on_progress,
+        name: run_behaviour(reference, n, first=REFERENCE_STREAM, n_workers=n_workers, on_progress=on_progress)
+        for name, reference, n in (
+            ("expert", best, n_episodes),
+            ("nothing", replace(best, policy="nothing"), N_NOTHING),
         )
-        for policy, n in (("expert", n_episodes), ("nothing", N_NOTHING))
     }
-    minimum, expert = (float(returns(runs[policy]).mean()) for policy in ("nothing", "expert"))
+    minimum, expert = (float(returns(runs[name]).mean()) for name in ("nothing", "expert"))
     if not expert > minimum:
         raise ZestError(f"the expert of task {behaviour.task!r} returns {expert:.3f}, no more than doing nothing")
     return References(minimum, expert, float(runs["expert"]["gt_success"].any(axis=1).mean()), n_episodes)

@@ -58,6 +58,8 @@ def collect_dataset(
     """
     path = reader.dataset_path(config.dataset_id)
     asked = {field.name: getattr(config, field.name) for field in fields(CollectConfig) if field.name != "dataset"}
+    if config.expert == "scripted":
+        del asked["expert"]  # it is not in the records of datasets that are older than the other kind
     asked["env"] = ENV_ID
     if not reader.exists(config.dataset_id):
         with artifacts.lock(path):  # of two equal commands the second one finds the work done
@@ -66,9 +68,13 @@ def collect_dataset(
                 return Collected(config.dataset_id, path, result, already_there=False)
     with reading_record(path, "choose another id with --dataset, or delete it"):
         before = _collected_before(config, asked, path)
-        behaviour = Behaviour(config.task, "expert", seed=config.seed, **{name: before[name] for name in LARGEST})
+        behaviour = _behaviour(config, {name: before[name] for name in LARGEST})
     remove_parts(behaviour)  # which a kill at the very end may leave
     return Collected(config.dataset_id, path, before, already_there=True)
+
+
+def _behaviour(config: CollectConfig, flaws: Mapping[str, float]) -> Behaviour:
+    return Behaviour(config.task, "rl" if config.expert == "rl" else "expert", seed=config.seed, **flaws)
 
 
 def _collect(
@@ -88,7 +94,7 @@ def _collect(
         done += n
         on_progress(done, n_references + config.n_episodes)
 
-    behaviour = Behaviour(config.task, "expert", seed=config.seed, **config.given_flaws)
+    behaviour = _behaviour(config, config.given_flaws)
     references = measure_references(behaviour, calibration.N_REFERENCE, n_workers=n_workers, on_progress=count)
     on_result(f"expert: return {references.expert:.2f}, success {references.expert_success:.0%}")
     if (name := config.calibrated) is not None:
@@ -104,6 +110,7 @@ def _collect(
     episodes = run_behaviour(behaviour, config.n_episodes, n_workers=n_workers, on_progress=count)
     flaws = {name: getattr(behaviour, name) for name in LARGEST}
     result = _result(episodes, flaws, references)
+    kind = "scripted expert" if config.expert == "scripted" else "randomized expert found by soft actor-critic"
     on_result(f"writing {path}")
     write_dataset(
         config.dataset_id,
@@ -111,8 +118,8 @@ def _collect(
         env_spec=env_spec(config.task).to_json(),
         ref_min_score=references.minimum,
         ref_max_score=references.expert,
-        algorithm_name="imperfect scripted expert",
-        description=f"Kitchen task {config.task}: {config.n_episodes} episodes of 100 steps by a scripted expert with "
+        algorithm_name=f"imperfect {kind}",
+        description=f"Kitchen task {config.task}: {config.n_episodes} episodes of 100 steps by a {kind} with "
         + (", ".join(f"{name} {value}" for name, value in flaws.items() if value) or "no flaws")
         + " (drawn per episode, see zest_rl.kitchen.behaviour.Behaviour).",
         zest={"collect": {"asked": dict(asked), "result": result, "provenance": artifacts.provenance()}},

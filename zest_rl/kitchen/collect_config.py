@@ -12,7 +12,8 @@ from zest_rl.kitchen.tasks import get_task
 LARGEST = {"noise_max": 2.0, "stop_share": 1.0, "slow_max": 0.9, "bias_max": 1.0, "grip_max": 0.1}
 """Largest values of the expert's flaws, any of which can be calibrated."""
 
-
+OF_RL = ("noise_max", "bias_max")
+"""The flaws that an expert found by RL can have: those of its actions. Others need the script's plan."""
 MAX_EPISODES = 1_000_000
 """75 GB, all of which are in memory when they are written."""
 
@@ -54,6 +55,8 @@ class CollectConfig:
     """Mean normalized return to calibrate to, in percent of the expert; the default is the paper's "Demo"."""
     seed: int = 0
     """Of starts, noise levels and noise."""
+    expert: Literal["scripted", "rl"] = "scripted"
+    """Who acts: a script, or a policy that soft actor-critic found, whose actions are samples of its Gaussian."""
     dataset: str = "zest/kitchen-{task}-noisy-v0"
     """Id of the new Minari dataset; {task} stands for the task."""
 
@@ -68,6 +71,11 @@ class CollectConfig:
             raise BadInput(f"one number can be calibrated, got {' and '.join(calibrated)}; give the others a value")
         get_task(self.task)
         check_flaws(self.given_flaws)
+        if self.expert not in ("scripted", "rl"):
+            raise BadInput(f"expert must be scripted or rl, got {self.expert!r}")
+        wrong = [name for name in LARGEST if name not in OF_RL and getattr(self, name) != 0.0]
+        if self.expert == "rl" and wrong:
+            raise BadInput(f"an expert found by RL has the flaws {' and '.join(OF_RL)}, got {', '.join(wrong)}")
 
     @property
     def dataset_id(self) -> str:

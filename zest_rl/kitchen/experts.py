@@ -227,6 +227,30 @@ class Joint:
         return rotate_about(np.array(vector), np.zeros(3), self._env.data.xaxis[self._id], self.position)
 
 
+class DoorPlane:
+    """Places in a hinged door's own plane: `s` from the hinge along the door, `n` from the door to its inside, in m."""
+
+    def __init__(self, joint: Joint, height: float) -> None:
+        self._joint, self._height = joint, height
+
+    def coordinates(self, point: Vector) -> tuple[float, float]:
+        """Return (s, n) of a point (3,)."""
+        along, inside = self._axes()
+        offset = (point - self._joint.anchor)[:2]
+        return float(offset @ along), float(offset @ inside)
+
+    def place(self, s: float, n: float) -> Vector:
+        """Return the point (3,) at (s, n), at the plane's height."""
+        along, inside = self._axes()
+        return np.append(self._joint.anchor[:2] + s * along + n * inside, self._height)
+
+    def _axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the horizontal unit vectors (2,) along the door and to its inside."""
+        angle = self._joint.position
+        along = np.array([np.cos(angle), np.sin(angle)])
+        return along, np.array([-along[1], along[0]])
+
+
 class _BarDragger:
     """Approach the bar from the front, close on it, drag it; the state decides which of the three."""
 
@@ -296,7 +320,7 @@ class _Pusher:
 class _DoorOpener:
     """Drag the door ajar, then push it from inside; the state decides the step.
 
-    Places are given in the door's own plane: `s` from the hinge along the door, `n` from the door to its inside.
+    Places are those of `DoorPlane`.
     """
 
     INSIDE, OUTER = 0.018, 0.08  # n beyond which the tip is behind the door; s past the free edge that is still near
@@ -311,11 +335,12 @@ class _DoorOpener:
         self._arm, self._joint = Arm(env, skill.tip_offset), Joint(env)
         self._bar_site = env.model.site(skill.drag.site).id
         self._dragger = _BarDragger(env, skill.drag, error)
+        self._plane = DoorPlane(self._joint, skill.height)
 
     def act(self) -> FloatArray:
         opened = abs(self._joint.position)
         tip, _ = self._arm.pose()
-        s, n = self._in_door_plane(tip)
+        s, n = self._plane.coordinates(tip)
         edge = self._skill.width
         behind = (n > self.INSIDE and s < edge + self.OUTER) or (edge - 0.04 < s < edge + self.OUTER and n > -0.15)
         if opened > self._skill.ajar or (opened > self._skill.barely_ajar and behind):
@@ -327,10 +352,10 @@ class _DoorOpener:
         yaw, yaw_per_angle = skill.yaw
         rotation = gripper_rotation(yaw + yaw_per_angle * min(1.0, abs(self._joint.position)), skill.pitch)
         if n > self.INSIDE and s < skill.width + self.PAST_EDGE:
-            target = self._joint.ahead(self._place(skill.push_at, self.PUSH_N), skill.lead)
+            target = self._joint.ahead(self._plane.place(skill.push_at, self.PUSH_N), skill.lead)
             return arm.move(target, rotation, CLOSED)
         if n > self.INSIDE and s < skill.width + self.OUTER:
-            return arm.move(self._place(skill.push_at, self.ENTER_N), rotation, CLOSED)
+            return arm.move(self._plane.place(skill.push_at, self.ENTER_N), rotation, CLOSED)
         bar = self._env.data.site_xpos[self._bar_site]
         if np.linalg.norm((tip - bar)[:2]) < self.AT_BAR and tip[2] > bar[2] - self.BELOW_BAR and s < 0.35:
             _, current = arm.pose()
@@ -340,19 +365,4 @@ class _DoorOpener:
         front, near, inside = self.ROUND_N
         need = np.clip((skill.width + self.ROUND_RANGE - s) / self.ROUND_RANGE, 0.0, 1.0)
         target_n = inside * (1.0 - need) + need * np.clip(n, front, near)
-        return arm.move(self._place(skill.width + self.ROUND_EDGE, target_n), rotation, CLOSED)
-
-    def _axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the horizontal unit vectors (2,) along the door and to its inside."""
-        angle = self._joint.position
-        along = np.array([np.cos(angle), np.sin(angle)])
-        return along, np.array([-along[1], along[0]])
-
-    def _in_door_plane(self, point: Vector) -> tuple[float, float]:
-        along, inside = self._axes()
-        offset = (point - self._joint.anchor)[:2]
-        return float(offset @ along), float(offset @ inside)
-
-    def _place(self, s: float, n: float) -> Vector:
-        along, inside = self._axes()
-        return np.append(self._joint.anchor[:2] + s * along + n * inside, self._skill.height)
+        return arm.move(self._plane.place(skill.width + self.ROUND_EDGE, target_n), rotation, CLOSED)

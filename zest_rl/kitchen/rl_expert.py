@@ -7,6 +7,7 @@ here because they make data and nothing is compared with them. A Gaussian policy
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,13 @@ import numpy as np
 from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.arm import Vector
 from zest_rl.kitchen.env import ACT_DIM, KitchenEnv
-from zest_rl.kitchen.experts import SKILLS, DragThenPush, Joint, Push, kitchen_of
+from zest_rl.kitchen.experts import SKILLS, DoorPlane, DragThenPush, Joint, Push, kitchen_of
 from zest_rl.types import FloatArray
 
 WEIGHTS = Path(__file__).with_name("experts_rl")
 FEATURE_DIM = 2 * ACT_DIM + 1 + 3 + 6
 _POSITION, _GAP = 0.5, 0.2  # rad or m that make a feature of 1
+_PUSH_N, _PAST_EDGE = 0.035, 0.045  # m behind a door at which it is pushed, and past its edge on the way there
 _LARGEST = 5.0  # features are clipped to it
 _LOG_STD = (-20.0, 2.0)  # as stable-baselines3 clips it
 Weights = Mapping[str, FloatArray]
@@ -34,17 +36,39 @@ class Senses:
     def __init__(self, env: KitchenEnv) -> None:
         """Read from `env`, whose task names the contact by its row in `SKILLS`."""
         skill = SKILLS[env.task.name]
-        self._skill = skill.drag if isinstance(skill, DragThenPush) else skill
         self._env, self._joint = env, Joint(env)
+        self._door = skill if isinstance(skill, DragThenPush) else None
+        self._skill = skill.drag if isinstance(skill, DragThenPush) else skill
         self._part, self._hand = env.model.site(self._skill.site).id, env.model.site("end_effector").id
 
     def gap(self) -> Vector:
-        """Return the way (3,) from the contact to the tip of the gripper, in m."""
-        data, skill = self._env.data, self._skill
+        """Return the way (3,) to the tip of the gripper, in m, from the contact or the next point behind a door."""
+        behind = self._behind_door()
+        return np.asarray(self._tip() - (behind[0] if behind else self._contact()))
+
+    def way_behind_door(self) -> float | None:
+        """Return how far the tip must go, in m, to push a door from inside; None before it is ajar, or for others."""
+        points = [self._tip(), *self._behind_door()]
+        return sum(float(np.linalg.norm(b - a)) for a, b in pairwise(points)) if len(points) > 1 else None
+
+    def _tip(self) -> Vector:
+        approach = self._env.data.site_xmat[self._hand].reshape(3, 3)[:, 2]
+        return np.asarray(self._env.data.site_xpos[self._hand] + self._skill.tip_offset * approach)
+
+    def _contact(self) -> Vector:
+        skill = self._skill
         offset = self._joint.turned(skill.contact) if isinstance(skill, Push) else np.array([0, 0, skill.grip_offset])
-        approach = data.site_xmat[self._hand].reshape(3, 3)[:, 2]
-        tip = data.site_xpos[self._hand] + skill.tip_offset * approach
-        return np.asarray(tip - data.site_xpos[self._part] - offset)
+        return np.asarray(self._env.data.site_xpos[self._part] + offset)
+
+    def _behind_door(self) -> list[Vector]:
+        """Return the points (3,) still to pass on the way round the free edge of a door that is ajar."""
+        door = self._door
+        if door is None or abs(self._joint.position) <= door.ajar:
+            return []
+        plane = DoorPlane(self._joint, door.height)
+        pushing = plane.place(door.push_at, _PUSH_N)
+        is_inside = plane.coordinates(self._tip())[1] > 0.0
+        return [pushing] if is_inside else [plane.place(door.width + _PAST_EDGE, 0.0), pushing]
 
     def features(self) -> FloatArray:
         """Return (`FEATURE_DIM`,) float32: the robot's positions and velocities, the progress, the gap, two axes."""

@@ -61,23 +61,35 @@ class ShapedKitchen(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatA
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
         """Advance by 80 ms."""
         _, _, terminated, truncated, info = self.env.step(action)
-        reward = shaped_reward(self.kitchen.progress, float(np.linalg.norm(self._senses.gap())), action)
+        distance, behind = float(np.linalg.norm(self._senses.gap())), self._senses.way_behind_door()
+        reward = shaped_reward(self.kitchen.progress, distance, action, behind)
         return self._senses.features(), reward, terminated, truncated, info
 
 
-def shaped_reward(progress: float, distance: float, action: FloatArray) -> float:
+def shaped_reward(progress: float, distance: float, action: FloatArray, behind: float | None = None) -> float:
     """Return the progress and more for its beginning and its end, for nearness (m) to the contact, and for calm.
 
     The term of the distance falls everywhere, since a hand far away must be led, and is steep near the contact. It
-    fades as the part begins to move: a door that is ajar is best pushed from inside, away from its bar.
+    fades as the part begins to move. From then on the way round the edge of a door counts likewise: a door that is ajar
+    is best pushed from inside, away from its bar.
+
+    Args:
+        progress: of the task's joint.
+        distance: from the tip to the contact, in m.
+        action: (9,).
+        behind: how far the tip must go to push a door from inside, in m.
     """
     progress = min(max(progress, 0.0), 1.03)
     moved = 0.3 * (1.0 - np.exp(-progress / 0.05))
     done = 0.5 * (progress >= SUCCESS_PROGRESS)
-    near = 1.0 - np.tanh(distance / 0.1) - 1.5 * distance
-    near = 0.3 * (1.0 + max(0.0, 1.0 - progress / 0.3) * (near - 1.0))
+    near = 0.3 * (1.0 + max(0.0, 1.0 - progress / 0.3) * (_nearness(distance) - 1.0))
+    inside = 0.3 * (1.0 + _nearness(behind)) if behind is not None else 0.0
     calm = -0.02 * np.square(action[:ARM_DIM]).mean()
-    return float(progress + moved + done + near + calm)
+    return float(progress + moved + done + near + inside + calm)
+
+
+def _nearness(distance: float) -> float:
+    return float(1.0 - np.tanh(distance / 0.1) - 1.5 * distance)
 
 
 def measure(weights: Weights, task: str, starts: range) -> tuple[float, float]:

@@ -138,24 +138,35 @@ def return_curve(method: Method) -> Series | None:
 
 
 def learning_curve(method: Method) -> Series | None:
-    """Return the training loss over gradient steps, with its range over seeds; None if logged less than twice."""
-    columns = []
+    """Return the training loss, or the returns while a policy learned in its environment, over what the log counts.
+
+    None if logged less than twice; of several seeds also the range.
+    """
+    quantity, columns = "training loss (mean squared error of actions)", []
     if not all((run / "metrics.csv").exists() for run in method.runs):
         return None  # a snapshot has no log
     for run in method.runs:
         path = run / "metrics.csv"
         check_file(path)
         with reading_record(path), path.open(newline="", encoding="utf-8") as file:
-            columns.append([(float(row["update"]), float(row["loss"])) for row in csv.DictReader(file)])
+            names, *rows = csv.reader(file)
+            learns_online = "return" in names
+            value = names.index("return" if learns_online else "loss")
+            columns.append([(float(row[0]), float(row[value])) for row in rows])
     length = min(map(len, columns))
     if length < 2:
         return None
-    return _curve(
-        method.name,
-        "training loss (mean squared error of actions)",
-        [update for update, _ in columns[0][:length]],
-        [[loss for _, loss in column[:length]] for column in columns],
-    )
+    steps = [step for step, _ in columns[0][:length]]
+    values = [[value for _, value in column[:length]] for column in columns]
+    if learns_online:
+        quantity, dataset = "return of the newest episodes in training", DatasetRecord.of_run(read_meta(method.runs[0]))
+        if dataset.ref_min_score is not None and dataset.ref_max_score is not None:
+            quantity = f"normalized {quantity}, %"
+            values = [
+                [*normalized_return(np.array(of_run), dataset.ref_min_score, dataset.ref_max_score)]
+                for of_run in values
+            ]
+    return _curve(method.name, quantity, steps, values)
 
 
 def _curve(name: str, quantity: str, steps: Sequence[float], columns: Sequence[Sequence[float]]) -> Series:

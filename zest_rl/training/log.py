@@ -15,25 +15,26 @@ from torch.utils.tensorboard import SummaryWriter
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.records import reading_record
 
-COLUMNS = ("loss", "grad_norm", "learning_rate", "updates_per_s")
+COLUMNS = ("update", "loss", "grad_norm", "learning_rate", "updates_per_s")
+"""Of a training on a dataset. The first column of a log counts."""
 
 
 class MetricsLog:
     """Appends rows to the log of a run; use it as a context manager."""
 
-    def __init__(self, run_dir: Path, n_done: int, more: Sequence[str] = ()) -> None:
-        """Open the log, and drop the rows that a killed run logged after update `n_done`.
+    def __init__(self, run_dir: Path, n_done: int, columns: Sequence[str] = COLUMNS) -> None:
+        """Open the log, and drop the rows that a killed run logged after `n_done`.
 
         Args:
             run_dir: the run's folder.
-            n_done: updates.
-            more: columns besides `COLUMNS`.
+            n_done: what is done, as the first column counts it.
+            columns: of the log.
 
         Raises:
             BadInput: what is there is no log.
         """
-        self._columns = (*COLUMNS, *more)
-        path, header = run_dir / "metrics.csv", ",".join(("update", *self._columns))
+        path, header = run_dir / "metrics.csv", ",".join(columns)
+        self._columns = columns[1:]
         with reading_record(path, "delete it to go on without the rows before this update"):
             lines = path.read_text(encoding="utf-8").splitlines() if path.exists() and n_done else []
             whole = [line for line in lines[1:] if line.count(",") == len(self._columns)]

@@ -38,7 +38,9 @@ from torch import nn
 from zest_rl.agents import get_agent
 from zest_rl.agents.base import (
     JUDGED,
+    Agent,
     OptimizerConfig,
+    Rules,
     autocast,
     check_fields,
     describe_data,
@@ -49,18 +51,16 @@ from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint, snapshot_folder
 from zest_rl.training.distributed import Group, launched, local_index, process_group
-from zest_rl.training.log import MetricsLog
+from zest_rl.training.log import COLUMNS, MetricsLog
 from zest_rl.types import Episode
 
 RESULT_KEYS = ("n_params", "model_sha256", "train_seconds", "made_by")  # keys of meta.json that are known at the end
 
 
 @dataclass(frozen=True)
-class TrainingConfig:
-    """How long and where a policy is trained; each algorithm has its own config besides."""
+class RunConfig:
+    """Where a policy is trained, and what of it is kept."""
 
-    n_updates: int = 5000
-    """Gradient steps."""
     seed: int = 0
     """Of weights, batches and dropout."""
     device: str = "auto"
@@ -75,14 +75,29 @@ class TrainingConfig:
     """Updates between policies kept in RUN/snapshots, which `zest evaluate` takes too; default none."""
 
     def __post_init__(self) -> None:
-        check_fields("training", self, {
+        check_fields("training", self, self.rules())
+
+    def rules(self) -> Rules:
+        """Return the rules of the fields."""
+        return {
             "seed": (self.seed >= 0, "0 or positive"),
-            "n_updates": (self.n_updates >= 1, "at least 1"),
             "threads": (self.threads is None or self.threads >= 1, "at least 1, or None"),
             "checkpoint_every": (self.checkpoint_every >= 1, "at least 1"),
             "log_every": (self.log_every >= 1, "at least 1"),
             "snapshot_every": (self.snapshot_every is None or self.snapshot_every >= 1, "at least 1, or None"),
-        })  # fmt: skip
+        }
+
+
+@dataclass(frozen=True)
+class TrainingConfig(RunConfig):
+    """How long and where a policy is trained on a dataset; each algorithm has its own config besides."""
+
+    n_updates: int = 5000
+    """Gradient steps."""
+
+    def rules(self) -> Rules:
+        """Return the rules of the fields."""
+        return {**super().rules(), "n_updates": (self.n_updates >= 1, "at least 1")}
 
 
 class OnProgress(Protocol):
@@ -123,9 +138,11 @@ def fit(
             of this training is gone.
     """
     definition = get_agent(agent)
+    if not isinstance(definition, Agent):
+        raise BadInput(f"{agent} learns in the environment, not from data alone; use zest_rl.online.runs.train")
     if not isinstance(agent_config, definition.config):
         raise BadInput(f"agent {agent!r} takes a {definition.config.__name__}, got a {type(agent_config).__name__}")
-    device = _find_device(config.device)
+    device = training_device(config.device)
     facts = describe_data(episodes)
     sample = definition.sampler(agent_config, facts, episodes)
     judge = definition.judge(agent_config, facts, episodes)
@@ -153,7 +170,7 @@ def fit(
     with (
         process_group(device) as group,
         _claimed(run_dir, request, group) as finished,
-        _torch_set_up(config.seed, request["threads"], device),
+        torch_set_up(config.seed, request["threads"], device),
     ):
         if finished:
             return run_dir
@@ -167,7 +184,7 @@ def fit(
         n_reported, row_update = 0, state.update
         tick = row_tick = time.perf_counter()
         judged_columns = () if judge is None else JUDGED
-        with MetricsLog(run_dir, state.update, judged_columns) if group.leads else nullcontext() as log:
+        with MetricsLog(run_dir, state.update, (*COLUMNS, *judged_columns)) if group.leads else nullcontext() as log:
             while state.update < config.n_updates:
                 # sample
                 rows, weight = group.share(sample(state.rng))
@@ -250,7 +267,7 @@ def _reseed_others(seed: int, group: Group, update: int) -> None:
 
 
 @contextmanager
-def _torch_set_up(seed: int, threads: int, device: torch.device) -> Iterator[None]:
+def torch_set_up(seed: int, threads: int, device: torch.device) -> Iterator[None]:
     """Seed torch and set its threads; restore both at the end."""
     before = torch.get_num_threads()
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
@@ -262,7 +279,12 @@ def _torch_set_up(seed: int, threads: int, device: torch.device) -> Iterator[Non
             torch.set_num_threads(before)
 
 
-def _find_device(name: str) -> torch.device:
+def training_device(name: str) -> torch.device:
+    """Return the device of a `RunConfig`; under ``torchrun``, this process's GPU.
+
+    Raises:
+        BadInput: it is none, or not there.
+    """
     kind, _, index = name.partition(":")
     if kind not in ("auto", "cpu", "cuda") or (index and not (kind == "cuda" and index.isdecimal())):
         raise BadInput(f"device must be auto, cpu, cuda or cuda:N, got {name!r}")
@@ -292,8 +314,8 @@ def _claimed(run_dir: Path, request: dict[str, Any], group: Group) -> Iterator[b
     """
     with artifacts.lock(run_dir) if group.leads else nullcontext():
         if group.leads:
-            _check_request(run_dir, request)
-        group.agree(data_sha256=request["data_sha256"], precision=request["precision"])  # and wait for `_check_request`
+            check_request(run_dir, request)
+        group.agree(data_sha256=request["data_sha256"], precision=request["precision"])  # and wait for `check_request`
         finished = (run_dir / "meta.json").exists()
         group.agree(finished=finished)
         yield finished
@@ -302,8 +324,12 @@ def _claimed(run_dir: Path, request: dict[str, Any], group: Group) -> Iterator[b
         group.agree()
 
 
-def _check_request(run_dir: Path, request: dict[str, Any]) -> None:
-    """Write ``run.json``, or check that the existing one holds the same arguments."""
+def check_request(run_dir: Path, request: dict[str, Any]) -> None:
+    """Write ``run.json``, or check that the existing one holds the same arguments.
+
+    Raises:
+        BadInput: it holds others, or the folder other files.
+    """
     path = run_dir / "run.json"
     if path.exists():
         defaults = _flat({"config": asdict(get_agent(request["agent"]).config())})  # of options newer than the run

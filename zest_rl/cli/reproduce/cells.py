@@ -57,6 +57,8 @@ class Cell:
     """Arguments of `zest evaluate`."""
     evaluation: EvaluationConfig
     """What these arguments mean."""
+    n_counted: int
+    """Updates, or steps in the environment, of the training."""
 
     @property
     def name(self) -> str:
@@ -107,11 +109,14 @@ def make_cells(comparison: Comparison, datasets: Mapping[str, TaskDatasets], out
                 arguments |= {"policy": identify(arguments["policy"], arguments["python"]).to_json()}
             except BadInput as error:
                 problems.append(f"{name!r}, trained on {dataset} with seed {seed}: {error}")
+        n_counted = arguments.get("n_updates", arguments.get("n_steps", 0))
         digest = artifacts.hash_json([arguments, agent, described[dataset]])
         run = output / "cells" / f"{task}-{agent}-{goal or 'ground-truth'}-seed{seed}-{digest[:8]}"
         train |= {"run_dir": str(run)}
         how = {**method.evaluate, **task_datasets.evaluate, "run": str(run)}
-        cells.append(Cell(task, name, run, agent, train, how, settings(load_config(EvaluateFlags, how, name))))
+        cells.append(
+            Cell(task, name, run, agent, train, how, settings(load_config(EvaluateFlags, how, name)), n_counted)
+        )
     if problems:
         raise BadInput("\n  ".join(["policies from elsewhere are missing; train them, then go on:", *problems]))
     return cells
@@ -131,10 +136,10 @@ def run_cells(
             cell.run.rename(gone)
             shutil.rmtree(gone)
     open_cells = {cell.name: cell for cell in cells if not _is_done(cell, done_folder)}
-    n_updates = {cell.run: cell.train.get("n_updates", 0) for cell in open_cells.values()}
+    n_counted = {cell.run: cell.n_counted for cell in open_cells.values()}
     with (
-        ui.progress("updates of all cells (evaluation follows)", sum(n_updates.values())) as advance,
-        _followed(n_updates.keys(), advance),
+        ui.progress("updates of all cells (evaluation follows)", sum(n_counted.values())) as advance,
+        _followed(n_counted.keys(), advance),
     ):
         for name in cached_jobs(_train_and_evaluate, open_cells, done_folder, n_workers=n_workers, stage="a cell"):
             ui.say(f"done: {name}")
@@ -158,12 +163,12 @@ def _train_and_evaluate(cell: Cell) -> dict[str, NDArray[np.float64]]:
     import numpy as np
 
     from zest_rl.agents.foreign import FOREIGN
+    from zest_rl.api import trainer
     from zest_rl.cli.evaluate import Config as EvaluateFlags
     from zest_rl.cli.train import split_config
     from zest_rl.evaluation.evaluate import evaluate, evaluation_folder
     from zest_rl.training.adoption import adopt
     from zest_rl.training.checkpoints import snapshots
-    from zest_rl.training.runs import train
 
     training_code, evaluation_code = cell.code_records
     if not (cell.run / "meta.json").exists():
@@ -173,7 +178,7 @@ def _train_and_evaluate(cell: Cell) -> dict[str, NDArray[np.float64]]:
     if cell.agent == FOREIGN:
         adopt(flags.policy, flags.dataset, name=flags.name, seed=flags.seed, python=flags.python, run_dir=flags.run_dir)
     else:
-        train(cell.agent, flags.dataset, *split_config(flags), run_dir=flags.run_dir)
+        trainer(cell.agent).train(cell.agent, flags.dataset, *split_config(flags), run_dir=flags.run_dir)
     trained = time.monotonic()
     how = load_config(EvaluateFlags, cell.evaluate, cell.method)
     for run in (cell.run, *snapshots(cell.run)):
@@ -188,7 +193,7 @@ def _followed(runs: Collection[Path], advance: Callable[[int], object]) -> Itera
 
     def show() -> None:
         nonlocal shown
-        n_done = sum(map(_updates_done, runs))
+        n_done = sum(map(_n_counted, runs))
         if n_done > shown:
             advance(n_done - shown)
             shown = n_done
@@ -207,10 +212,9 @@ def _followed(runs: Collection[Path], advance: Callable[[int], object]) -> Itera
         show()
 
 
-def _updates_done(run: Path) -> int:
+def _n_counted(run: Path) -> int:
     try:
-        rows = (run / "metrics.csv").read_text(encoding="utf-8").splitlines()
-        return int(rows[-1].split(",")[rows[0].split(",").index("update")])
+        return int((run / "metrics.csv").read_text(encoding="utf-8").splitlines()[-1].partition(",")[0])
     except (OSError, IndexError, ValueError):
         return 0
 

@@ -15,7 +15,18 @@ from typing import Any, Protocol
 from zest_rl.cli.ui import shortened
 from zest_rl.runtime import artifacts
 
-ROOMS = ("types.py", "data", "simulation", "kitchen", "embedders", "rewards", "agents", "training", "evaluation")
+ROOMS = (
+    "types.py",
+    "data",
+    "simulation",
+    "kitchen",
+    "embedders",
+    "rewards",
+    "agents",
+    "training",
+    "evaluation",
+    "online",
+)
 """What a policy and its returns depend on. ``runtime`` decides where the work runs and how it is kept, ``metrics`` and
 ``report`` what is made of finished cells, and relabeled rewards are in a cell's identity themselves. Versions of other
 packages are not recorded here; a run's ``meta.json`` has them."""

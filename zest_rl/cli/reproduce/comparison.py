@@ -34,6 +34,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
+from zest_rl.cli.arguments import arguments_of
 from zest_rl.cli.config import load_config, read_recipe
 from zest_rl.cli.reproduce.tasks import GivenDataset, checked_table, located, read_given, read_tasks
 from zest_rl.errors import BadInput, nearest
@@ -195,7 +196,9 @@ def _read_method(tables: ComparisonTables, method: Mapping[str, Any], where: str
     else:
         by_agent = {key: value for key, value in tables.train.items() if key in AGENTS and isinstance(value, dict)}
         shared = {key: value for key, value in tables.train.items() if key not in by_agent}
-        train = {"n_updates": 5000, "threads": 1, "device": "cpu"}
+        train = {"threads": 1, "device": "cpu"}
+        if "n_updates" in arguments_of(run_config(table.agent_or_foreign)):
+            train["n_updates"] = 5000
         for given in (shared, by_agent.get(table.agent_or_foreign, {}), flags):
             train |= checked_table(given, where, "dataset", "seed", "run_dir")
     load_config(run_config(table.agent_or_foreign), {**train, "dataset": ""}, where)
