@@ -36,8 +36,8 @@ from zest_rl.training.runs import default_run_dir, scorer_files
 from zest_rl.training.runs import train as train_on_data
 from zest_rl.types import Episode
 
-TREX_UPDATES = 1000
-"""Gradient steps of the T-REX that is trained on the way."""
+TREX_UPDATES = 500
+"""Gradient steps of the T-REX that is trained on the way; its accuracy on held-out pairs rises until about 400."""
 
 
 def train(
