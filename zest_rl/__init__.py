@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from zest_rl.analysis.curves import Curve, score
     from zest_rl.api import (
         collect,
+        curate,
         evaluate,
         export,
         inspect,
@@ -30,8 +31,8 @@ if TYPE_CHECKING:
     from zest_rl.embedders import load_embedder
 
 __all__ = [
-    "Curve", "collect", "evaluate", "export", "inspect", "load_embedder", "load_policy", "open_dataset", "push",
-    "relabel", "report", "score", "train", "with_rewards",
+    "Curve", "collect", "curate", "evaluate", "export", "inspect", "load_embedder", "load_policy", "open_dataset",
+    "push", "relabel", "report", "score", "train", "with_rewards",
 ]  # fmt: skip
 __version__ = "0.1.0"
 __path__ = [*__path__, f"{__path__[0]}/kitchen/aliases"]  # modules that datasets on disk name by an earlier name

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from zest_rl.agents import Policy
     from zest_rl.analysis.cross_task import JointInspection
+    from zest_rl.analysis.curated import Curation
     from zest_rl.data.reader import Dataset
     from zest_rl.evaluation.evaluate import Evaluation
     from zest_rl.export import Exported, Format
@@ -133,6 +134,29 @@ def inspect(
     if output is not None:
         write_report(inspection_report(inspected), Path(output))
     return inspected
+
+
+def curate(
+    dataset: AnyDataset,
+    keep: float = 0.8,
+    *,
+    source: str | Path | None = None,
+    output: str | Path | None = None,
+    dry_run: bool = False,
+) -> Curation:
+    """Write a dataset without the episodes that score worst; see `zest_rl.analysis.curated.curate`.
+
+    Args:
+        dataset: relabeled.
+        keep: share of the episodes to keep.
+        source: the robomimic file or LeRobot folder that it was relabeled from, to curate that, too.
+        output: the table, a CSV; default DATASET.curated.csv here.
+        dry_run: write nothing.
+    """
+    from zest_rl.analysis.curated import curate as curate_id
+
+    table = None if output is None else Path(output)
+    return curate_id(_id(dataset), keep, source=source, output=table, dry_run=dry_run)
 
 
 class Trainer(NamedTuple):

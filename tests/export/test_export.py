@@ -162,6 +162,21 @@ def test_lerobot_folders_hold_a_row_per_frame_and_progress_beside_them(scored: s
     assert not (tmp_path / "other").exists()
 
 
+def test_lerobot_s_visualizer_draws_the_scores_of_each_episode(scored: str, tmp_path: Path) -> None:
+    """Its rule, `loadEpisodeProgressGroup` of lerobot-dataset-visualizer 38e581b, src/app/…/fetch-data.ts."""
+    path = export(scored, "lerobot", tmp_path / "data").path / "sarm_progress.parquet"
+    file = parquet.ParquetFile(path)
+    codecs = {file.metadata.row_group(0).column(i).compression for i in range(file.metadata.num_columns)}
+    assert codecs <= {"SNAPPY", "UNCOMPRESSED"}, "hyparquet decompresses nothing else"
+    rows = file.read().to_pylist()
+    column = next(name for name in ("progress_sparse", "progress_dense", "progress") if name in rows[0])
+    own = [score[:-1] for score in read(scored, Dataset.scores)]
+    low, high = min(map(np.min, own)), max(map(np.max, own))
+    for episode, score in enumerate(own):
+        shown = sorted((row["index"], row[column]) for row in rows if row["episode_index"] == episode)
+        np.testing.assert_allclose([value for _, value in shown], (score - low) / (high - low), rtol=1e-6)
+
+
 def test_progress_needs_scores_and_takes_no_shape(collected: str, tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="relabel it with `zest relabel`"):
         export(collected, "lerobot-progress", tmp_path / "x")

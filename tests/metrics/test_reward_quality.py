@@ -72,6 +72,25 @@ def test_average_precision_equals_a_loop_over_thresholds(returns: list[int], dra
 
 @pytest.mark.usefixtures("quick")
 @one_patch_for_all_examples
+@given(small, st.data())
+def test_precision_at_k_equals_the_mean_over_all_choices_among_equal_returns(
+    returns: list[int], draw: st.DataObject
+) -> None:
+    n = len(returns)
+    success = draw.draw(st.lists(st.booleans(), min_size=n, max_size=n))
+    k = draw.draw(st.integers(1, n))
+    limit = sorted(returns, reverse=True)[k - 1]
+    above = [i for i in range(n) if returns[i] > limit]
+    at_limit = [i for i in range(n) if returns[i] == limit]
+    shares = [
+        sum(success[i] for i in (*above, *chosen)) / k for chosen in itertools.combinations(at_limit, k - len(above))
+    ]
+    got = reward_quality.precision_at(k, np.array(returns, float), np.array(success))
+    assert equal(got.value, float(np.mean(shares)))
+
+
+@pytest.mark.usefixtures("quick")
+@one_patch_for_all_examples
 @given(st.integers(0, 100))
 def test_epic_distance_is_that_of_pearson_s_correlation_over_all_transitions(seed: int) -> None:
     a, b = noise(seed), noise(seed + 1)

@@ -1,8 +1,8 @@
 """How a dataset was made: typed records of the entry "zest" in its metadata, which a run's ``meta.json`` repeats.
 
-Stages that leave a record: ``collect`` (`CollectRecord`), ``recorded`` (steps per second of an imported dataset), and
-what made the rewards, ``relabel`` (`RelabelRecord`) or ``given`` (`GivenRecord`). Fields that an earlier version did
-not write have defaults; unknown ones are ignored.
+Stages that leave a record: ``collect`` (`CollectRecord`), ``recorded`` (steps per second of an imported dataset), what
+made the rewards, ``relabel`` (`RelabelRecord`) or ``given`` (`GivenRecord`), and which episodes were kept, ``curate``
+(`CurateRecord`). Fields that an earlier version did not write have defaults; unknown ones are ignored.
 """
 
 from __future__ import annotations
@@ -153,6 +153,18 @@ class GivenRecord:
 
 
 @dataclass(frozen=True)
+class CurateRecord:
+    """Which episodes were kept (`zest_rl.analysis.curation`)."""
+
+    source: str
+    """Id of the dataset that the others were dropped from."""
+    episodes: tuple[int, ...]
+    """Of each episode its index before any were dropped, over all times that some were."""
+    provenance: Mapping[str, Any] | None = None
+    """Command, versions and machine; left out of a run's ``meta.json``."""
+
+
+@dataclass(frozen=True)
 class DatasetRecord:
     """Environment and scale of a dataset, and how it was made."""
 
@@ -168,6 +180,8 @@ class DatasetRecord:
     """None: its rewards are no ZeST scores."""
     given: GivenRecord | None
     """None: nobody gave its rewards."""
+    curate: CurateRecord | None
+    """None: it has all episodes."""
     fps: float | None
     """Steps per second of the recording that it was imported from, if known."""
 
@@ -183,13 +197,14 @@ class DatasetRecord:
             for stage, record in stages.items():
                 if not isinstance(record, Mapping):
                     raise TypeError(f"{stage} must be an object, got {record!r:.80}")
-            collect, relabel, given = (stages.get(stage) for stage in ("collect", "relabel", "given"))
+            collect, relabel, given, curate = map(stages.get, ("collect", "relabel", "given", "curate"))
             made = {
                 "id": dataset_id,
                 **{name: metadata.get(name) for name in ("env_spec", "ref_min_score", "ref_max_score")},
                 "collect": CollectRecord(**field_values(CollectRecord, collect)) if collect else None,
                 "relabel": RelabelRecord.from_json(relabel) if relabel else None,
                 "given": GivenRecord(**field_values(GivenRecord, given)) if given else None,
+                "curate": CurateRecord(**field_values(CurateRecord, curate)) if curate else None,
                 "fps": stages.get("recorded", {}).get("fps"),
             }
             read = cls(**field_values(cls, made))

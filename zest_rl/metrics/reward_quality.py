@@ -196,6 +196,26 @@ def average_precision(returns: Values, success: NDArray[np.bool_]) -> Estimate:
     return over_episodes(area, len(returns))
 
 
+def precision_at(k: int, returns: Values, success: NDArray[np.bool_]) -> Estimate:
+    """Share of successes (N,) bool among the k episodes with the highest returns; chance is their share of all.
+
+    Of equal returns at the limit each counts for the share that is still to be chosen among them.
+    """
+    returns, labels = np.asarray(returns, dtype=np.float64), np.asarray(success, dtype=bool)
+    if returns.shape != labels.shape or returns.ndim != 1 or not 1 <= k <= len(returns):
+        raise BadInput(
+            f"k must be from 1 to the number of returns, and there must be as many successes, got {k}, "
+            f"{returns.shape}, {labels.shape}"
+        )
+
+    def share(i: NDArray[np.intp]) -> float:
+        limit = np.sort(returns[i])[-k]
+        above, equal = returns[i] > limit, returns[i] == limit
+        return float((labels[i][above].sum() + (k - above.sum()) * labels[i][equal].mean()) / k)
+
+    return over_episodes(share, len(returns))
+
+
 def epic_distance(scores: Sequence[FloatArray], truth: Sequence[FloatArray]) -> Estimate:
     """EPIC distance of two rewards on the dataset's transitions, in [0, 1]; 0: equal up to scale and offset.
 

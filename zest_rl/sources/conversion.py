@@ -55,6 +55,8 @@ class ConvertedTrajectories:
     path: Path
     format: str
     """Name of the format."""
+    names: tuple[str, ...]
+    """Of every episode in it: ``demo_3`` of robomimic, the ``episode_index`` of LeRobot."""
     n_steps: tuple[int, ...]
     """T of every episode."""
     n_bytes: int

@@ -203,7 +203,8 @@ def open_lerobot(
                 )
     n_bytes = 4 * sum((root / file).stat().st_size for file, _ in files)  # parquet compresses by less than that
     read = partial(read_episodes, root, files, n_steps, columns)
-    trajectories = ConvertedTrajectories(root, "LeRobot", n_steps, n_bytes, read, info.fps)
+    names = tuple(str(episode.number) for episode in listed)
+    trajectories = ConvertedTrajectories(root, "LeRobot", names, n_steps, n_bytes, read, info.fps)
     if not views:
         return trajectories, None
     if not are_videos:

@@ -159,7 +159,8 @@ def open_robomimic(
         n_bytes = 4 * sum(n_steps) * (32 + sum(int(np.prod(entry.shape[1:])) for entry in numbers))
     pictures = picture_entries(path, f"{names[0]}/obs")
     read = partial(read_episodes, path.resolve(), names)
-    trajectories = ConvertedTrajectories(path.resolve(), "robomimic", tuple(n_steps), n_bytes, read)
+    demos = tuple(name.removeprefix("data/") for name in names)
+    trajectories = ConvertedTrajectories(path.resolve(), "robomimic", demos, tuple(n_steps), n_bytes, read)
     if not with_frames or not (keys or any(form.channels for form in pictures.values())):
         return trajectories, None
     chosen = choose_pictures(pictures, keys, str(path), "obs")

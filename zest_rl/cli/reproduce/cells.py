@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from zest_rl.cli.config import load_config
 from zest_rl.cli.reproduce import code
-from zest_rl.cli.reproduce.comparison import Comparison, run_config
+from zest_rl.cli.reproduce.comparison import Comparison, MethodTable, run_config
 from zest_rl.cli.ui import Ui
 from zest_rl.errors import BadInput
 
@@ -83,22 +83,32 @@ def make_cells(comparison: Comparison, datasets: Mapping[str, TaskDatasets], out
         BadInput: policies that were trained elsewhere are not there; all of them are named.
     """
     from zest_rl.agents.foreign import identify
+    from zest_rl.analysis.curated import curate
     from zest_rl.cli.evaluate import Config as EvaluateFlags
     from zest_rl.cli.evaluate import settings
     from zest_rl.data.reader import open_dataset
     from zest_rl.runtime import artifacts
 
     described = {}
-    for dataset in (name for task in datasets.values() for name in (task.source, *task.relabeled.values())):
-        with open_dataset(dataset) as ds:
-            described[dataset] = ds.describe()
+
+    def chosen(method: MethodTable, of_task: TaskDatasets) -> str:
+        """Return the dataset that a method is trained on, which `described` then holds."""
+        dataset = of_task.source if method.goal is None else of_task.relabeled[method.goal]
+        if method.keep is not None:
+            table = output / "curated" / f"{dataset.split('/')[-1]}-{method.keep}.csv"
+            dataset = str(curate(dataset, method.keep, output=table).dataset_id)
+        if dataset not in described:
+            with open_dataset(dataset) as ds:
+                described[dataset] = ds.describe()
+        return dataset
+
     cells, problems = [], []
     triples = product(comparison.tables.seeds, comparison.methods.items(), datasets.items())
     for seed, (name, method), (task, task_datasets) in triples:
         if seed not in method.seeds:
             continue
         goal, agent = method.table.goal, method.table.agent_or_foreign
-        dataset = task_datasets.source if goal is None else task_datasets.relabeled[goal]
+        dataset = chosen(method.table, task_datasets)
         train = {**method.train, "dataset": dataset, "seed": seed}
         if method.table.policy is not None:
             policy = method.table.policy.replace("{task}", task).replace("{seed}", str(seed))

@@ -18,8 +18,8 @@ A recipe has these tables (keys are the flags of the verb)::
     [train.AGENT]                   `zest train AGENT`, for all methods with this agent
     [evaluate]                      `zest evaluate`, for all methods
     [methods."NAME"]                agent = "dt", goal = "NAME" (left out: ground-truth rewards), kind, note, paper,
-                                    evaluate = {…} of this method alone, seeds = […] if not all of them, and the
-                                    agent's own flags
+                                    evaluate = {…} of this method alone, seeds = […] if not all of them, keep = 0.8
+                                    (`zest curate` by that goal, before training), and the agent's own flags
     [methods."NAME"]                policy = "torchscript:FILE" in place of the agent: `zest adopt`; {task} and {seed}
                                     stand for those of the cell, and goal says on whose rewards it was trained
 
@@ -78,8 +78,12 @@ class MethodTable:
     evaluate: dict[str, Any] = field(default_factory=dict)
     seeds: tuple[int, ...] | None = None
     """Those of the recipe's that it is trained with; None: all."""
+    keep: float | None = None
+    """Share of the episodes that `zest curate` keeps by the goal's scores; None: all."""
 
     def __post_init__(self) -> None:
+        if self.keep is not None and (self.goal is None or not 0 < self.keep < 1):
+            raise BadInput(f"keep must be above 0 and below 1, and needs a goal, got {self.keep} and {self.goal!r}")
         if (self.agent is None) == (self.policy is None):
             raise BadInput(f"a method has either an agent or a policy, got {self.agent!r} and {self.policy!r}")
 
