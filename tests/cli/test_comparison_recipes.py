@@ -39,7 +39,7 @@ def test_a_goal_may_be_the_ends_of_an_episode_of_the_kitchen(tmp_path: Path) -> 
         ("seeds = [0]", 'seeds = ["0"]', "'seeds' must be a list of an integer, got ['0']"),
         ("seeds = [0]", "seeds = [0, 0]", "seeds must be at least 1 number, all different"),
         ('agent = "bc"', 'agent = "bc"\nseeds = [1]', "seeds must be some of the recipe's seeds [0], got [1]"),
-        ('agent = "bc"', 'agent = "bc"\nkeep = 0.5', "keep must be above 0 and below 1, and needs a goal"),
+        ('agent = "bc"', 'agent = "bc"\nkeep = 1.0', "keep must be above 0 and below 1, and needs a goal, got 1.0"),
         ('agent = "bc"', 'agent = "bc"\nseeds = []', "[methods.'BC']: seeds must be some of"),
         ("[relabel]", "[relabel.all]", "[goals.'scene']: unknown key 'all'"),
         ("[methods.BC]", "[methods]", "'methods' must be a table of tables"),
