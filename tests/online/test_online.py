@@ -229,6 +229,21 @@ def test_the_truth_is_the_reward_before_relabeling(trained: Path, tmp_path: Path
     assert artifacts.read_json(run / "meta.json")["dataset"]["id"] == "zest/kitchen-micro-tiny-v0"
 
 
+def test_a_learned_reward_is_of_the_same_task(collected: str, tmp_path: Path) -> None:
+    trex = zest_rl.train("trex", collected, run_dir=tmp_path / "trex", n_updates=2, hidden_size=16, threads=1)
+    settings = {**SMALL, **SETTINGS, "n_steps": 10, "reward": str(trex)}
+    assert (zest_rl.train("sac", collected, run_dir=tmp_path / "run", **settings) / "model.safetensors").exists()
+
+    meta = artifacts.read_json(trex / "meta.json")
+    meta["dataset"]["env_spec"] = meta["dataset"]["env_spec"].replace('"micro"', '"sdoor"')
+    artifacts.write_json(trex / "meta.json", meta)
+    with pytest.raises(
+        BadInput, match=r"task sdoor, but zest/kitchen-micro-tiny-v0 is of .* task micro; train it on this"
+    ):
+        zest_rl.train("sac", collected, run_dir=tmp_path / "other", **settings)
+    assert not (tmp_path / "other").exists()
+
+
 @pytest.mark.slow
 def test_a_killed_run_goes_on(trained: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"

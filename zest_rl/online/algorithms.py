@@ -30,7 +30,7 @@ class SymmetricReplay(ReplayBuffer):
 
     def __init__(self, *args: Any, recorded: ReplayBufferSamples, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        self._recorded = recorded
+        self._recorded = ReplayBufferSamples(*(tensor.to(self.device) for tensor in recorded[:5]))
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Draw half of a batch from each."""

@@ -69,6 +69,7 @@ def policy_card(meta: Mapping[str, Any]) -> str:
         "algorithm": meta["agent"] if n_params is None else f"{meta['agent']}, {n_params} parameters",
         "trained on": f"{dataset.id}, sha256 of the data `{meta['data_sha256']}`",
         **({"rewards": own} if relabel is None else _scorer_rows(relabel)),
+        **({"learned from": meta["config"]["reward"]} if "reward" in meta.get("config", {}) else {}),
         **({} if n_updates is None else {"updates": str(n_updates)}),
         "seed": str(meta["seed"]),
         **({"weights": f"sha256 `{meta['model_sha256']}`"} if "model_sha256" in meta else {}),

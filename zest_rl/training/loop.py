@@ -68,11 +68,11 @@ class RunConfig:
     threads: int | None = None
     """CPU threads; default torch's own. The last digits of the result depend on it."""
     checkpoint_every: int = 500
-    """Updates between checkpoints, from which an interrupted run goes on."""
+    """Updates, or steps in the environment, between checkpoints, from which an interrupted run goes on."""
     log_every: int = 50
-    """Updates between log rows (metrics.csv, TensorBoard), which hold means over these updates."""
+    """Updates, or steps, between log rows (metrics.csv, TensorBoard), which hold means over these updates."""
     snapshot_every: int | None = None
-    """Updates between policies kept in RUN/snapshots, which `zest evaluate` takes too; default none."""
+    """Updates, or steps, between policies kept in RUN/snapshots, which `zest evaluate` takes too; default none."""
 
     def __post_init__(self) -> None:
         check_fields("training", self, self.rules())
