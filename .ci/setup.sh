@@ -68,7 +68,7 @@ install_python_packages() {
             "Debian, Ubuntu: apt-get install python3-venv"
     fi
     echo "installing the tested packages into .venv (some minutes, about 7 GB)"
-    .venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[dev]'
+    .venv/bin/python -m pip install --disable-pip-version-check -c constraints.txt -e '.[dev]'
 }
 
 install_browser() {

@@ -45,9 +45,11 @@ def print_failure(error: BaseException, *, as_json: bool) -> int:
 
 
 def _listing(value: Mapping[str, Any], indent: str = "") -> list[str]:
-    """Write a result as ``key: value`` lines, nested mappings indented."""
+    """Write a result as ``key: value`` lines, nested mappings indented; what does not apply (None) is left out."""
     lines = []
     for key, item in value.items():
+        if item is None:
+            continue
         if isinstance(item, Mapping) and item.keys() == {"value", "low", "high"}:
             lines.append(f"{indent}{key}: {_estimate(key, item, value.get('n_episodes'))}")
         elif isinstance(item, Mapping):
