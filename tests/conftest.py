@@ -20,6 +20,14 @@ settings.register_profile("zest", deadline=None, derandomize=True)  # a busy mac
 settings.load_profile("zest")
 
 
+def pytest_configure() -> None:
+    """Give each of several test processes a core of its own, so that commands there start no processes unasked."""
+    worker = os.environ.get("PYTEST_XDIST_WORKER")
+    if worker is not None and hasattr(os, "sched_setaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {cores[int(worker.removeprefix("gw")) % len(cores)]})
+
+
 collect_ignore = ["interop"]
 """Tests against libraries that need environments of their own: `make test-interop`."""
 

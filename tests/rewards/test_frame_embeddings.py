@@ -77,7 +77,7 @@ def test_the_paths_of_all_episodes_are_not_sent_with_each_job(source: Source, tm
 
 
 def test_the_kitchen_embedded_by_distinct_states_is_the_kitchen_embedded_frame_by_frame(collected: str) -> None:
-    source = kitchen_source(collected, Views("micro", n_views=2, size=96, tolerance=0.05))
+    source = kitchen_source(collected, Views("micro", n_views=1, size=96, tolerance=0.05))
     frames = source.frames
     assert isinstance(frames, KitchenStates)
     by_state = StateEmbeddings(StateEmbedder(frames.ring, "efficientnet-lite0", n_workers=1), frames.states)
