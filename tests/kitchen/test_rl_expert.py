@@ -15,20 +15,21 @@ from zest_rl.kitchen import rl_training
 from zest_rl.kitchen.behaviour import Behaviour, behaviour_folder, rollout
 from zest_rl.kitchen.collect_config import CollectConfig
 from zest_rl.kitchen.env import ACT_DIM, ARM_DIM, KitchenEnv, env_spec
+from zest_rl.kitchen.experts import make_expert
 from zest_rl.kitchen.rl_expert import WEIGHTS, RLExpert, Senses, make_rl_expert, weights_file
 from zest_rl.kitchen.rl_training import ShapedKitchen, shaped_reward, train
+from zest_rl.kitchen.tasks import TASKS
 from zest_rl.runtime import artifacts
 
-EXPERTS = sorted(path.stem for path in WEIGHTS.glob("*.safetensors"))
 RANDOMIZED = Behaviour("sdoor", "rl", noise_max=0.3)
 
 
-@pytest.mark.parametrize("task", EXPERTS)
+@pytest.mark.parametrize("task", TASKS)
 def test_an_expert_solves_its_task(task: str) -> None:
     assert rollout(Behaviour(task, "rl-mean"), 0)["gt_success"].any()
 
 
-@pytest.mark.parametrize("task", EXPERTS)
+@pytest.mark.parametrize("task", TASKS)
 def test_the_weights_are_those_of_their_record_which_is_of_95_percent_of_100_starts_or_more(task: str) -> None:
     record = artifacts.read_json(WEIGHTS / f"{task}.json")
     weights = load_file(weights_file(task))
@@ -79,6 +80,21 @@ def test_the_gap_closes_as_the_hand_comes_to_the_contact() -> None:
         env.step(expert.act())
         distances.append(np.linalg.norm(senses.gap()))
     assert distances[-1] < 0.1 < 0.4 < distances[0]
+
+
+def test_the_way_behind_a_door_that_is_ajar_leads_round_its_edge() -> None:
+    env = ShapedKitchen("ldoor")
+    env.reset(seed=0)
+    senses, script = Senses(env.kitchen), make_expert("ldoor", env)
+    ways, rewards = [], []
+    while not env.kitchen.progress > 1.0:
+        rewards.append(env.step(script.act())[1])
+        ways.append(senses.way_behind_door())
+    n_closed = ways.index(next(way for way in ways if way is not None))
+    assert n_closed > 10
+    assert None not in ways[n_closed:]
+    assert ways[-1] < 0.05 < 0.2 < ways[n_closed]
+    assert min(rewards[n_closed:]) > max(rewards[:n_closed]), "letting go of the bar costs nothing"
 
 
 def test_the_reward_rises_with_progress_nearness_and_calm() -> None:
