@@ -118,7 +118,7 @@ def test_clips_are_embedded_once(root: Path) -> None:
     n_embedded = []
 
     class Counting:
-        cache_key, dim = embedder.cache_key, embedder.dim
+        fingerprint, dim = embedder.fingerprint, embedder.dim
 
         def embed_images(self, frames: Any) -> Any:
             n_embedded.append(len(frames))
