@@ -93,7 +93,7 @@ class Sizes:
 FULL = Sizes(Views("micro", n_views=8))
 DRY_RUN = Sizes(
     Views("micro", n_views=1), n_few=1, n_many=2, n_frames=8, n_reference=8, batches=(8,), seconds=0.0,
-    n_updates={"bc": 20, "dt": 10}, n_cpu_updates={"bc": 20, "dt": 10}, n_curve=10, n_episodes=2,
+    n_updates={"bc": 4, "dt": 4}, n_cpu_updates={"bc": 4, "dt": 4}, n_curve=4, n_episodes=2,
 )  # fmt: skip
 
 
@@ -293,8 +293,7 @@ class TrainJob:
     def metrics(self) -> list[dict[str, float]]:
         """Train, or read what was logged before."""
         config = get_agent(self.agent).config(**({"dropout": 0.0, "amp": "fp32"} if self.exact else {}))
-        log_every = 5 if self.exact or self.n_updates < 100 else 50
-        options = TrainingConfig(n_updates=self.n_updates, device=self.device, log_every=log_every)
+        options = TrainingConfig(n_updates=self.n_updates, device=self.device, log_every=max(1, self.n_updates // 20))
         train(self.agent, self.dataset_id, config, options, run_dir=self.run)
         with (self.run / "metrics.csv").open(encoding="utf-8") as file:
             return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
