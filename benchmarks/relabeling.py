@@ -38,7 +38,7 @@ from zest_rl.runtime.gl import select_gl_backend
 from zest_rl.runtime.parallel import chunks, one_thread
 from zest_rl.sources.kitchen import kitchen_source
 
-REQUIRED_RATIO = 25.0
+REQUIRED_RATIO = 180.0
 REQUIRED_RESCORING_S = 2.0
 N_PLAIN_FRAMES = 5
 N_ROUNDS = 3

@@ -86,7 +86,7 @@ def relabel(dataset: AnyDataset, goal: str | Path = "same-scene", **flags: Any) 
         goal: folder with ``init/`` and ``goal/``, "text:closed drawer -> open drawer", "episode:3", or for the kitchen
             "same-scene", "toys", "text" or "drawings".
         **flags: frames, camera, env, robot, look_at, views, show_robot, tolerance, skip_incomplete, masks, embedder,
-            features, similarity, precision, goal_share, reward, shuffle, device, n_workers, engine, on_start,
+            features, similarity, precision, backend, goal_share, reward, shuffle, device, n_workers, engine, on_start,
             on_progress. What `zest relabel --preview` draws, `zest_rl.rewards.preview.preview` draws.
     """
     from zest_rl.rewards.relabel import relabel as relabel_dataset

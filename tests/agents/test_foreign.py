@@ -409,7 +409,7 @@ def test_what_cannot_be_read_is_refused_and_leaves_no_folder(
         (
             "onnx:noise.onnx",
             1,
-            "ONNX policies need onnxruntime, which is not installed: pip install 'zest-rl[foreign]'",
+            "ONNX policies need onnxruntime, which is not installed: pip install onnxruntime",
         ),
         ("command:no-such-program", 2, "there is no program 'no-such-program'"),
     ):

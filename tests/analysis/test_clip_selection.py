@@ -118,7 +118,7 @@ def test_clips_are_embedded_once(root: Path) -> None:
     n_embedded = []
 
     class Counting:
-        fingerprint, dim = embedder.fingerprint, embedder.dim
+        cache_key, dim = embedder.cache_key, embedder.dim
 
         def embed_images(self, frames: Any) -> Any:
             n_embedded.append(len(frames))

@@ -199,6 +199,20 @@ def test_a_saved_scorer_gives_the_same_bits_and_needs_no_goal(
     assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "scorer.safetensors").read_bytes()
 
 
+@pytest.mark.parametrize(("backend", "used"), [("auto", "onnxruntime"), ("torch", "torch")])
+def test_a_scorer_goes_on_with_the_backend_that_made_it(
+    backend: Any, used: str, episodes: list[np.ndarray], tmp_path: Path
+) -> None:
+    config = replace(CONFIG, backend=backend)
+    made = StateScorer.build(config, VIEWS, episodes[0][0], device="cpu", n_workers=1).scorer
+    assert made.record.backend == used
+    described = made.record.to_json()["config"]
+    assert described.get("backend") == (None if used == "torch" else used), "records of torch are as they always were"
+    made.save(tmp_path / "scorer.safetensors")
+    loaded = Scorer.load(tmp_path / "scorer.safetensors", device="cpu")
+    assert (loaded.config.backend, loaded.record) == (backend, made.record)
+
+
 def test_a_scorer_of_other_weights_is_refused(tmp_path: Path) -> None:
     import timm
 

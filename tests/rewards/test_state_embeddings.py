@@ -270,8 +270,9 @@ def test_a_process_that_rendered_ends_quietly() -> None:
     assert done.stdout.split("\n")[:2] == ["(1, 32, 32, 3)", "(1, 64, 64, 3)"]
 
 
+@pytest.mark.parametrize("backend", ["auto", "torch"])
 def test_embeddings_do_not_depend_on_torchs_threads_and_leave_them_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    backend: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = torch.get_num_threads()
     results = []
@@ -279,7 +280,7 @@ def test_embeddings_do_not_depend_on_torchs_threads_and_leave_them_alone(
         for n_threads in (1, 3):
             monkeypatch.setenv("ZEST_CACHE", str(tmp_path / str(n_threads)))
             torch.set_num_threads(n_threads)
-            results.append(embedded(single(), opening(2))[0])
+            results.append(embedded(single(backend=backend), opening(2))[0])
             assert torch.get_num_threads() == n_threads
     finally:
         torch.set_num_threads(before)
@@ -289,7 +290,7 @@ def test_embeddings_do_not_depend_on_torchs_threads_and_leave_them_alone(
 # --- one cache per way of looking ---
 
 
-def test_other_views_networks_or_precisions_have_another_cache_and_another_device_has_not() -> None:
+def test_other_views_networks_precisions_or_backends_have_another_cache_and_another_device_has_not() -> None:
     embedders = [
         single(),
         single(replace(VIEWS, n_views=3)),
@@ -297,6 +298,7 @@ def test_other_views_networks_or_precisions_have_another_cache_and_another_devic
         single(replace(VIEWS, robot=True)),
         single(replace(VIEWS, tolerance=0)),
         single(precision="bf16"),
+        single(backend="torch"),
     ]
     folders = [embedder.folder for embedder in embedders]
     assert len(set(folders)) == len(embedders)

@@ -3,7 +3,7 @@
 | spec | policy |
 |---|---|
 | `torchscript:FILE.pt` | a TorchScript module, as d3rlpy's `save_policy("FILE.pt")` writes it |
-| `onnx:FILE.onnx` | an ONNX graph of one input (extra `foreign`); external weights lie in `FILE.onnx.data` |
+| `onnx:FILE.onnx` | an ONNX graph of one input; external weights lie in `FILE.onnx.data` |
 | `d3rlpy:FILE.d3` | a d3rlpy model, run in a separate process by a Python that has d3rlpy |
 | `command:WORDS …` | any program that speaks the protocol of `zest_rl.agents.child` |
 | `NAME:REST` | an entry point of another package (group `zest_rl.policies`): a function from REST to a callable |
@@ -348,9 +348,7 @@ def _read_onnx(path: Path) -> Act:
     try:
         import onnxruntime
     except ImportError as error:
-        raise ZestError(
-            "ONNX policies need onnxruntime, which is not installed: pip install 'zest-rl[foreign]'"
-        ) from error
+        raise ZestError("ONNX policies need onnxruntime, which is not installed: pip install onnxruntime") from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     try:

@@ -189,7 +189,7 @@ def select_clips(
         )
     clips = _first_of_each(clips, things, max_clips)
     goal_clips = clips if within else _first_of_each(goal_clips, things, max_clips)
-    network = load_embedder(embedder, device=device, precision=precision)
+    network = load_embedder(embedder, device=device, precision=precision, one_thread=True)
     distinct = clips if within else [*clips, *goal_clips]
     vectors = embed_clips(distinct, network, n_frames, on_progress)
     embeddings, goal_embeddings = vectors[: len(clips)], vectors[-len(goal_clips) :]

@@ -17,7 +17,6 @@ from zest_rl.rewards.embeddings import check_equal
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_arrays, write_arrays
 from zest_rl.runtime.cache import cache_folder
-from zest_rl.runtime.parallel import one_thread
 from zest_rl.types import FloatArray
 
 OPENING = "Opening [something]"
@@ -152,7 +151,7 @@ def embed_clips(
     for clip in clips:
         parts = sorted(clip.path.iterdir()) if clip.path.is_dir() else [clip.path]
         content = [artifacts.hash_file(path) for path in parts if path.is_file()]
-        digest = artifacts.hash_json([content, embedder.fingerprint, n_frames])
+        digest = artifacts.hash_json([content, embedder.cache_key, n_frames])
         paths.append(folder / f"{digest[:20]}.npz")
     rng = np.random.default_rng()
     cached = [path for path in paths if path.exists()]
@@ -160,12 +159,10 @@ def embed_clips(
     for clip, path in zip(clips, paths, strict=True):
         arrays = read_arrays(path, {"embeddings": (np.float32, (None, embedder.dim))})
         if arrays is None:
-            with one_thread():
-                arrays = {"embeddings": embedder.embed_images(read_frames(clip.path, n_frames))}
+            arrays = {"embeddings": embedder.embed_images(read_frames(clip.path, n_frames))}
             write_arrays(path, arrays)
         elif path == checked:
-            with one_thread():
-                again = embedder.embed_images(read_frames(clip.path, n_frames)[:1])
+            again = embedder.embed_images(read_frames(clip.path, n_frames)[:1])
             check_equal(folder, [(arrays["embeddings"][:1], again)])
         vectors.append(arrays["embeddings"])
         if on_progress is not None:

@@ -29,7 +29,6 @@ from zest_rl.rewards.scorer import Scorer, ScorerConfig
 from zest_rl.rewards.scores import Features, Similarity
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.files import is_there, user_path
-from zest_rl.runtime.parallel import one_thread
 from zest_rl.types import FloatArray, Frame
 
 if TYPE_CHECKING:
@@ -163,12 +162,11 @@ def score(
     spec = read_states(start, goal, first)
     scorer = Scorer.build(ScorerConfig(spec.name, embedder, features, similarity, precision), spec, device=device)
     scorer.check_goal(device)
-    network, parts, last = shared_embedder(embedder, precision, device), [], first
+    network, parts, last = shared_embedder(embedder, precision, device, "auto"), [], first
     rest = chain([first], frames)
-    with one_thread():
-        while batch := list(islice(rest, STEPS_PER_BATCH)):
-            parts.append(network.embed_images(batch))
-            last = batch[-1]
+    while batch := list(islice(rest, STEPS_PER_BATCH)):
+        parts.append(network.embed_images(batch))
+        last = batch[-1]
     embeddings = np.concatenate(parts)
     if len(embeddings) < 2:
         raise BadInput(

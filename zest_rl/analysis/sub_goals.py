@@ -194,7 +194,7 @@ def follow_video(
         BadInput: there is no sub-goal or a duplicate, the video or a sub-goal cannot be read, or a goal is a sentence
             and the embedder takes pictures only.
     """
-    network = load_embedder(embedder, device=device, precision=precision)
+    network = load_embedder(embedder, device=device, precision=precision, one_thread=True)
     if not goals or len(set(goals)) < len(goals):
         raise BadInput(f"a video needs 1 or more sub-goals, each once, got {', '.join(goals) or 'none'}")
     frames = read_frames(clip, n_frames)

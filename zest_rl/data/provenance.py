@@ -53,6 +53,9 @@ class ScorerRecord:
     precision: str = "auto"
     goal_share: float = 1.0
     """Share of the goals that were used."""
+    backend: str = "torch"
+    """What computed the embeddings of the goal and, unless a GPU did, of the frames; before there was a choice, torch.
+    It is no part of a dataset's name: "torch" and "onnxruntime" agree to 1e-5 of an embedding's length."""
     views: Mapping[str, Any] | None = None
     """Of a `ViewsRecord`, from which kitchen states were rendered; of a scorer's file, also those of another scene."""
     views_sha256: str | None = None
@@ -71,6 +74,8 @@ class ScorerRecord:
         names = ("goal", "embedder", "features", "similarity", "precision", "goal_share")
         hashes = {"goal_sha256": self.goal_sha256, "embedder_sha256": self.embedder_sha256}
         config = {name: getattr(self, name) for name in names}
+        if self.backend != "torch":  # so that records of torch stay as they were
+            config["backend"] = self.backend
         if self.views is None:
             return {"config": config, **hashes}
         return {"config": {"views": dict(self.views), **config}, **hashes, "views_sha256": self.views_sha256}

@@ -16,14 +16,16 @@ tag's weights. A checkpoint is a `.safetensors` file or what `torch.save` or Tor
 read and nothing is run. It must fill every parameter except the classification head, which is cut off: no embedder ever
 runs on random weights. Images go through each model's own preprocessing.
 
-Torch is imported only when a network is needed: the default embedder knows its `fingerprint` and `dim` without it, so
-that work on cached embeddings starts at once.
+On a CPU the default is computed by ONNX Runtime (`zest_rl.embedders.lite0`), which needs no torch; all others, and all
+on a GPU, in bf16, or where ONNX Runtime is not installed, by torch, which is imported when a network is needed.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import re
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -34,6 +36,7 @@ import numpy as np
 from zest_rl.embedders.checkpoints import DEFAULT_EMBEDDER, LITE0_PREPROCESSING, installed_weights
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime.artifacts import hash_arrays, hash_file, hash_json
+from zest_rl.runtime.parallel import one_thread as on_one_thread
 from zest_rl.types import FloatArray, Frame
 
 if TYPE_CHECKING:
@@ -41,9 +44,14 @@ if TYPE_CHECKING:
 
     from zest_rl.embedders.base import Network
 
-__all__ = ["DEFAULT_EMBEDDER", "Embedder", "Precision", "find_device", "load_embedder"]
+__all__ = ["DEFAULT_EMBEDDER", "Backend", "Embedder", "Precision", "find_device", "load_embedder"]
 
 Precision = Literal["auto", "fp32", "bf16"]
+Backend = Literal["auto", "torch"]
+"""What computes the default embedder in fp32 on a CPU: ONNX Runtime if it is installed, or torch in any case."""
+ONNX_RUNTIME = "onnxruntime"
+GPU_DRIVERS = ("/proc/driver/nvidia", "/dev/dxg", "/dev/nvhost-gpu", "/dev/kfd")
+"""Where Linux shows a GPU that torch may use: NVIDIA's, also through WSL and of a Jetson, and AMD's."""
 
 
 class Embedder(Protocol):
@@ -55,7 +63,15 @@ class Embedder(Protocol):
 
     @property
     def fingerprint(self) -> str:
-        """64 hex digits over network, weights, preprocessing and precision; not over device or batch size."""
+        """64 hex digits over network, weights, preprocessing and precision; not over device, backend or batch size."""
+
+    @property
+    def backend(self) -> str:
+        """What computes the vectors of images: "torch" or "onnxruntime"; the two agree to 1e-5 of a vector's length."""
+
+    @property
+    def cache_key(self) -> str:
+        """64 hex digits over fingerprint and backend, so that a cache holds vectors that repeat to the bit."""
 
     @property
     def dim(self) -> int:
@@ -88,6 +104,8 @@ def load_embedder(
     device: str = "auto",
     precision: Precision = "auto",
     batch_size: int = 16,
+    backend: Backend = "auto",
+    one_thread: bool = False,
 ) -> Embedder:
     """Return the embedder that `uri` names (see the table above).
 
@@ -98,13 +116,17 @@ def load_embedder(
             embedded default stays fp32: its small deltas suffer from bf16 (cosine to fp32 .89 to .99 on renderings,
             against ≥ .9999 for ViT-B/32 and ResNet50).
         batch_size: frames or sentences per forward pass.
+        backend: "auto", or "torch" for vectors that equal those of versions without ONNX Runtime.
+        one_thread: compute on one thread, so that vectors do not depend on the number of cores.
 
     Raises:
-        BadInput: unknown family, model, tag or device; a checkpoint that cannot be read or does not fit the model.
+        BadInput: unknown family, model, tag, device or backend; a checkpoint that cannot be read or does not fit.
         ZestError: the weights are not cached and cannot be fetched.
     """
     if precision not in get_args(Precision):
         raise BadInput(f"unknown precision {precision!r}; {nearest(precision, get_args(Precision))}")
+    if backend not in get_args(Backend):
+        raise BadInput(f"unknown backend {backend!r}; {nearest(backend, get_args(Backend))}")
     if batch_size < 1:
         raise BadInput(f"batch_size must be at least 1, got {batch_size}")
     _check_device(device)
@@ -121,7 +143,10 @@ def load_embedder(
         fingerprint = hash_json(
             [uri, hash_file(weights), LITE0_PREPROCESSING, bf16, "batch norms folded, padded evenly"]
         )
-        return _NetworkEmbedder(uri, fingerprint, 1280, False, batch_size, load_lite0)
+        by_onnx = backend == "auto" and not bf16 and importlib.util.find_spec(ONNX_RUNTIME) and _is_cpu(device)
+        return _NetworkEmbedder(
+            uri, fingerprint, 1280, False, batch_size, one_thread, load_lite0, weights if by_onnx else None
+        )
 
     from zest_rl.embedders.networks import build
 
@@ -129,7 +154,7 @@ def load_embedder(
     fingerprint = _fingerprint(uri, network, bf16)
     _place(network, device, bf16)
     reads_text = network.encode_texts is not None
-    return _NetworkEmbedder(uri, fingerprint, network.dim, reads_text, batch_size, lambda: network)
+    return _NetworkEmbedder(uri, fingerprint, network.dim, reads_text, batch_size, one_thread, lambda: network)
 
 
 @dataclass(frozen=True)
@@ -141,11 +166,41 @@ class _NetworkEmbedder:
     dim: int
     reads_text: bool
     batch_size: int
+    one_thread: bool
     load: Callable[[], Network]
+    lite0_weights: Path | None = None
+    """Of the default embedder if ONNX Runtime computes it."""
+
+    @property
+    def backend(self) -> str:
+        return "torch" if self.lite0_weights is None else ONNX_RUNTIME
+
+    @property
+    def cache_key(self) -> str:
+        return self.fingerprint if self.lite0_weights is None else hash_json([self.fingerprint, self.backend])
 
     @cached_property
     def _network(self) -> Network:
         return self.load()
+
+    @cached_property
+    def _embed_frames(self) -> Callable[[Sequence[Frame]], FloatArray]:
+        if self.lite0_weights is None:
+            return self._by_torch(self._network.embed_frames)
+        from zest_rl.embedders import lite0
+
+        network = lite0.load(self.lite0_weights, one_thread=self.one_thread)
+        return lambda frames: network(lite0.batch(frames))
+
+    def _by_torch(self, encode: Callable[[Any], torch.Tensor]) -> Callable[[Any], FloatArray]:
+        import torch
+
+        def by_torch(items: Any) -> FloatArray:
+            with torch.inference_mode(), on_one_thread() if self.one_thread else nullcontext():
+                vectors: FloatArray = encode(items).float().cpu().numpy()
+                return vectors
+
+        return by_torch
 
     def embed_images(self, frames: Sequence[Frame]) -> FloatArray:
         for i, frame in enumerate(frames):
@@ -154,22 +209,19 @@ class _NetworkEmbedder:
                     f"frame {i} must have shape (H, W, 3) and dtype uint8, "
                     f"got shape {frame.shape} and dtype {frame.dtype}"
                 )
-        return self._embed(frames, self._network.embed_frames, "frame")
+        return self._embed(frames, self._embed_frames, "frame")
 
     def embed_texts(self, sentences: Sequence[str]) -> FloatArray:
         encode = self._network.encode_texts if self.reads_text else None
         if encode is None:
             raise BadInput(f"{self.uri} reads images only; for sentences use one like open_clip:ViT-B-32/openai")
-        return self._embed(list(sentences), encode, "sentence")
+        return self._embed(list(sentences), self._by_torch(encode), "sentence")
 
-    def _embed(self, items: Sequence[Any], encode: Callable[[Any], torch.Tensor], what: str) -> FloatArray:
-        import torch
-
+    def _embed(self, items: Sequence[Any], encode: Callable[[Any], FloatArray], what: str) -> FloatArray:
         vectors = np.empty((len(items), self.dim), np.float32)
-        with torch.inference_mode():
-            for start in range(0, len(items), self.batch_size):
-                batch = slice(start, start + self.batch_size)
-                vectors[batch] = encode(items[batch]).float().cpu().numpy()
+        for start in range(0, len(items), self.batch_size):
+            batch = slice(start, start + self.batch_size)
+            vectors[batch] = encode(items[batch])
         bad = np.flatnonzero(~np.isfinite(vectors).all(axis=1))
         if len(bad):
             raise ZestError(
@@ -213,6 +265,13 @@ def find_device(device: str) -> torch.device:
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     return torch.device(device)
+
+
+def _is_cpu(device: str) -> bool:
+    """Whether `find_device` returns the CPU; asks torch only where there is a GPU."""
+    if device == "auto" and not any(Path(driver).exists() for driver in GPU_DRIVERS):
+        return True
+    return device == "cpu" or find_device(device).type == "cpu"
 
 
 def _place(network: Network, device: str, bf16: bool) -> Network:

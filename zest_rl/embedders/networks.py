@@ -21,7 +21,7 @@ from timm.layers.norm_act import BatchNormAct2d
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from zest_rl.embedders import checkpoints, hugging_face
+from zest_rl.embedders import checkpoints, hugging_face, lite0
 from zest_rl.embedders.base import ENTRY_POINTS, Network, Preprocess
 from zest_rl.embedders.resizing import preprocess_squares
 from zest_rl.errors import BadInput, ZestError, nearest
@@ -98,9 +98,8 @@ def build_lite0(weights: Path) -> Network:
     module.reset_classifier(0)  # type: ignore[operator]
     _fold_batch_norms(module.eval())
     _pad_in_convolutions(module)
-    options = checkpoints.LITE0_PREPROCESSING
-    on_gpu = partial(preprocess_squares, options=options)
-    return Network(module, create_transform(**options), module, preprocess_squares=on_gpu)
+    on_gpu = partial(preprocess_squares, options=checkpoints.LITE0_PREPROCESSING)
+    return Network(module, lambda image: torch.from_numpy(lite0.pixels(image)), module, preprocess_squares=on_gpu)
 
 
 def _fold_batch_norms(module: nn.Module) -> None:

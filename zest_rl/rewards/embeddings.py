@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.embedders import Embedder, Precision, load_embedder
+from zest_rl.embedders import Backend, Embedder, Precision, load_embedder
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.types import FloatArray
 
@@ -79,9 +79,9 @@ def check_equal(folder: Path, pairs: Iterable[tuple[FloatArray | None, FloatArra
 
 
 @functools.lru_cache(maxsize=2)
-def shared_embedder(uri: str, precision: Precision, device: str) -> Embedder:
-    """Return this process's embedder of a URI; the default's network is loaded at its first picture."""
-    return load_embedder(uri, device=device, precision=precision)
+def shared_embedder(uri: str, precision: Precision, device: str, backend: Backend) -> Embedder:
+    """Return this process's embedder of a URI, on one thread; the default's network is loaded at its first picture."""
+    return load_embedder(uri, device=device, precision=precision, backend=backend, one_thread=True)
 
 
 @dataclass(frozen=True)
@@ -91,19 +91,21 @@ class WorkerEmbedder:
     uri: str
     precision: Precision
     device: str
-    fingerprint: str
+    backend: Backend
+    cache_key: str
     """Of the embedder of the process that asks; it names the cache."""
 
     def load(self) -> Embedder:
         """Return this process's embedder.
 
         Raises:
-            BadInput: weights, precision or versions differ between the machines.
+            BadInput: weights, precision, backend or versions differ between the machines.
         """
-        embedder = shared_embedder(self.uri, self.precision, self.device)
-        if embedder.fingerprint != self.fingerprint:
+        embedder = shared_embedder(self.uri, self.precision, self.device, self.backend)
+        if embedder.cache_key != self.cache_key:
             raise BadInput(
-                f"embedder {self.uri} of this worker is not that of the process that asked: weights, precision or "
-                "versions differ; install the same on every node, and choose --precision fp32 or bf16"
+                f"embedder {self.uri} of this worker is not that of the process that asked: weights, precision, "
+                "backend or versions differ; install the same on every node, and choose --precision fp32 or bf16 and "
+                "--backend torch"
             )
         return embedder

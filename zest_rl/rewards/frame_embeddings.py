@@ -16,13 +16,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.embedders import Precision
+from zest_rl.embedders import Backend, Precision
 from zest_rl.errors import BadInput
 from zest_rl.rewards.embeddings import N_CHECKED, EmbeddedEpisode, WorkerEmbedder, check_equal, shared_embedder
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import Layout, read_arrays, write_arrays
 from zest_rl.runtime.cache import cache_folder
-from zest_rl.runtime.parallel import Engine, cached_jobs, one_thread, run_jobs
+from zest_rl.runtime.parallel import Engine, cached_jobs, run_jobs
 from zest_rl.sources.base import EpisodeFrames, Source
 from zest_rl.types import FloatArray, Frame
 
@@ -62,10 +62,9 @@ def _embed_episode(shared: _Shared, job: _Job) -> dict[str, NDArray[Any]]:
             last = views
 
     changes = changed()
-    with one_thread():
-        while batch := list(islice(changes, STEPS_PER_BATCH)):
-            vectors = embedder.embed_images([frame for views in batch for frame in views])
-            parts.append(vectors.reshape(len(batch), -1, embedder.dim))
+    while batch := list(islice(changes, STEPS_PER_BATCH)):
+        vectors = embedder.embed_images([frame for views in batch for frame in views])
+        parts.append(vectors.reshape(len(batch), -1, embedder.dim))
     n_frames = len(index)
     if n_frames not in (job.n_steps, job.n_steps + 1):
         number = f"more than {job.n_steps + 1}" if n_frames > job.n_steps else str(n_frames)
@@ -79,8 +78,7 @@ def _embed_episode(shared: _Shared, job: _Job) -> dict[str, NDArray[Any]]:
 def _embed_frame(shared: _Shared, place: tuple[int, int]) -> FloatArray:
     """Embed one frame, (episode, step), of all views: (V, D)."""
     episode, step = place
-    with one_thread():
-        return shared.embedder.load().embed_images(list(next(islice(shared.frames.read(episode), step, None))))
+    return shared.embedder.load().embed_images(list(next(islice(shared.frames.read(episode), step, None))))
 
 
 class FrameEmbeddings:
@@ -94,25 +92,26 @@ class FrameEmbeddings:
         embedder: str,
         precision: Precision = "auto",
         *,
+        backend: Backend = "auto",
         device: str = "auto",
         n_workers: int | None = None,
         engine: Engine = "local",
     ) -> None:
         """Hash the frames of a source.
 
-        `embedder` is a URI, `precision` and `device` as in `zest_rl.embedders.load_embedder`; `n_workers` and `engine`
-        as in `zest_rl.runtime.parallel.run_jobs`.
+        `embedder` is a URI, `precision`, `backend` and `device` as in `zest_rl.embedders.load_embedder`; `n_workers`
+        and `engine` as in `zest_rl.runtime.parallel.run_jobs`.
 
         Raises:
             BadInput: frames or the embedder cannot be read.
         """
-        network = shared_embedder(embedder, precision, device)
-        self._shared = _Shared(source.frames, WorkerEmbedder(embedder, precision, device, network.fingerprint))
+        network = shared_embedder(embedder, precision, device, backend)
+        self._shared = _Shared(source.frames, WorkerEmbedder(embedder, precision, device, backend, network.cache_key))
         self._layout: Layout = {"embeddings": (np.float32, (None, len(source.frames.views), network.dim))}
         self._source, self._n_workers, self._engine = source, n_workers, engine
         self._n_steps = source.trajectories.n_steps
         self._digests = [source.frames.digest(episode) for episode in range(len(self._n_steps))]
-        self._folder: Path = cache_folder("frames", network.fingerprint[:20])
+        self._folder: Path = cache_folder("frames", network.cache_key[:20])
         self.n_embedded = 0
         """Episodes that were not in the cache."""
 

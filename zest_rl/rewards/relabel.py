@@ -15,7 +15,7 @@ from zest_rl.data import reader
 from zest_rl.data.folders import CARD_FILE, GOAL_FOLDER
 from zest_rl.data.provenance import RelabelRecord
 from zest_rl.data.writer import write_scored
-from zest_rl.embedders import DEFAULT_EMBEDDER, Precision
+from zest_rl.embedders import DEFAULT_EMBEDDER, Backend, Precision
 from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.views import Views
 from zest_rl.rewards.cards import dataset_card
@@ -117,6 +117,7 @@ def relabel(
     features: Features = "delta",
     similarity: Similarity = "cos",
     precision: Precision = "auto",
+    backend: Backend = "auto",
     goal_share: float = 1.0,
     **options: Any,
 ) -> Relabeled:
@@ -125,7 +126,7 @@ def relabel(
     `dataset` and `frames` … `masks` choose the frames (`open_source`), `goal` and `embedder` … `goal_share`
     the scorer (`ScorerConfig`); the other options and the errors are those of `relabel_source`.
     """
-    config = ScorerConfig(goal, embedder, features, similarity, precision, goal_share)
+    config = ScorerConfig(goal, embedder, features, similarity, precision, goal_share, backend)
     source = open_source(
         dataset,
         frames=frames,
@@ -252,7 +253,7 @@ def _open(
     ring = frames.ring if isinstance(frames, KitchenStates) else None
     scorer = Scorer.build(config, read_source_goal(config.goal, source), views=ring, device=device)
     if not isinstance(frames, KitchenStates):
-        return scorer, FrameEmbeddings(source, config.embedder, config.precision, **options)
+        return scorer, FrameEmbeddings(source, config.embedder, config.precision, backend=config.backend, **options)
     return scorer, StateEmbeddings(StateScorer.of(scorer, **options).embedder, frames.states)
 
 

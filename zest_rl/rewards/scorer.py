@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from zest_rl.data.env_specs import is_maker
 from zest_rl.data.provenance import ScorerRecord
-from zest_rl.embedders import DEFAULT_EMBEDDER, Embedder, Precision
+from zest_rl.embedders import DEFAULT_EMBEDDER, ONNX_RUNTIME, Backend, Embedder, Precision
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen.views import Views
 from zest_rl.rewards.embeddings import EmbeddedEpisode, check_equal, shared_embedder
@@ -37,7 +37,6 @@ from zest_rl.runtime.arrays import read_arrays, write_arrays
 from zest_rl.runtime.cache import cache_folder
 from zest_rl.runtime.files import check_file
 from zest_rl.runtime.hub import SCORER_FILE as SCORER_FILE
-from zest_rl.runtime.parallel import one_thread
 from zest_rl.runtime.records import from_json, reading_record
 from zest_rl.runtime.trust import check_trusted, remember
 from zest_rl.simulation.makers import check_named, named_by_user
@@ -62,6 +61,7 @@ class ScorerConfig:
     precision: Precision = "auto"
     goal_share: float = 1.0
     """Share of the goals that are used: the nearest to the ends of the episodes (`Scorer.goals_near`)."""
+    backend: Backend = "auto"
 
     def __post_init__(self) -> None:
         check_names(self.features, self.similarity)
@@ -80,6 +80,8 @@ class Scorer:
     goal_sha256: str
     """Hash of the goal's content, before any choice among its pictures."""
     embedder_sha256: str
+    backend: str
+    """What computes the embedder, see `zest_rl.embedders.Embedder`."""
     views: Views | SceneViews | None = None
     """How the frames are rendered from states; None where they are not, and where a dataset holds their embeddings."""
     goal: GoalSpec | None = None
@@ -92,21 +94,21 @@ class Scorer:
         Raises:
             BadInput: the goal is a sentence and the embedder reads pictures only.
         """
-        embedder = shared_embedder(config.embedder, config.precision, device)
+        embedder = shared_embedder(config.embedder, config.precision, device, config.backend)
         if config.embedder != DEFAULT_EMBEDDER:
             remember("embedder", config.embedder)
         starts, goals = embed_goal_cached(goal, embedder)
-        return cls(config, starts, goals, goal.fingerprint(), embedder.fingerprint, views, goal)
+        return cls(config, starts, goals, goal.fingerprint(), embedder.fingerprint, embedder.backend, views, goal)
 
     def check_goal(self, device: str) -> None:
         """Embed a start and a goal again, and compare, because they may be from the cache; raises as `check_equal`."""
         if self.goal is None:
             return
-        embedder = shared_embedder(self.config.embedder, self.config.precision, device)
+        config = self.config
+        embedder = shared_embedder(config.embedder, config.precision, device, config.backend)
         i, k = np.random.default_rng().integers([len(self.goal.starts), len(self.goal.goals)])
         pair = replace(self.goal, starts=self.goal.starts[i : i + 1], goals=self.goal.goals[k : k + 1])
-        with one_thread():
-            start, goal = embed_goal(pair, embedder)
+        start, goal = embed_goal(pair, embedder)
         check_equal(cache_folder("goals"), [(self.starts[i], start[0]), (self.goals[k], goal[0])])
 
     def score(self, embeddings: FloatArray) -> FloatArray:
@@ -176,7 +178,7 @@ class Scorer:
     def record(self) -> ScorerRecord:
         """Config and content hashes, for provenance."""
         return ScorerRecord(
-            **asdict(self.config),
+            **asdict(self.config) | {"backend": self.backend},
             goal_sha256=self.goal_sha256,
             embedder_sha256=self.embedder_sha256,
             views=None if self.views is None else asdict(self.views),
@@ -213,8 +215,8 @@ class Scorer:
         """
         config, views, saved, starts, goals = _read(path)
         _check_named(path, config, views)
-        embedder = shared_embedder(config.embedder, config.precision, device)
-        scorer = cls(config, starts, goals, saved.goal_sha256, embedder.fingerprint, views)
+        embedder = shared_embedder(config.embedder, config.precision, device, config.backend)
+        scorer = cls(config, starts, goals, saved.goal_sha256, embedder.fingerprint, embedder.backend, views)
         record = scorer.record
         changed = [key for key in ("embedder_sha256", "views_sha256") if getattr(record, key) != getattr(saved, key)]
         if changed:
@@ -271,6 +273,7 @@ def _read(path: Path) -> tuple[ScorerConfig, Views | SceneViews | None, ScorerRe
             starts, goals = file.get_tensor("starts"), file.get_tensor("goals")
         values = dict(described["config"])
         views = _read_views(values.pop("views")) if "views" in values else None
+        values["backend"] = "auto" if values.get("backend") == ONNX_RUNTIME else "torch"  # as the dataset was scored
         config = from_json(ScorerConfig, values)
         for array in (starts, goals):
             if (
@@ -301,7 +304,7 @@ def embed_goal_cached(goal: GoalSpec, embedder: Embedder) -> tuple[FloatArray, F
             f"goal {goal.name!r} is a sentence, but embedder {embedder.uri!r} reads pictures only; use one that "
             "reads text, e.g. open_clip:ViT-B-32/openai, or a goal of pictures"
         )
-    digest = artifacts.hash_json([goal.fingerprint(), embedder.fingerprint])
+    digest = artifacts.hash_json([goal.fingerprint(), embedder.cache_key])
     path = cache_folder("goals") / f"{digest[:20]}.npz"
 
     def form(pictures: Sequence[Any]) -> tuple[type[np.float32], tuple[int, ...]]:
@@ -309,8 +312,7 @@ def embed_goal_cached(goal: GoalSpec, embedder: Embedder) -> tuple[FloatArray, F
 
     cached = read_arrays(path, {"starts": form(goal.starts), "goals": form(goal.goals)})
     if cached is None:
-        with one_thread():
-            starts, goals = embed_goal(goal, embedder)
+        starts, goals = embed_goal(goal, embedder)
         write_arrays(path, {"starts": starts, "goals": goals})
         return starts, goals
     return cached["starts"], cached["goals"]

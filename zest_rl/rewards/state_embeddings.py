@@ -23,12 +23,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.embedders import Precision
+from zest_rl.embedders import Backend, Precision
 from zest_rl.rewards.embeddings import N_CHECKED, EmbeddedEpisode, WorkerEmbedder, check_equal, shared_embedder
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import Layout, read_arrays, write_arrays
 from zest_rl.runtime.cache import cache_folder
-from zest_rl.runtime.parallel import Engine, cached_jobs, chunks, one_thread, run_jobs
+from zest_rl.runtime.parallel import Engine, cached_jobs, chunks, run_jobs
 from zest_rl.simulation.views import each_once, state_keys
 from zest_rl.sources.base import StateViews
 from zest_rl.types import FloatArray
@@ -51,12 +51,11 @@ def _embed_states(job: _Job) -> dict[str, NDArray[np.generic]]:
     embedder = job.embedder.load()
     embeddings: dict[str, FloatArray] = {}  # by frames, which are equal where states differ in what no view sees
     rows = []
-    with one_thread():
-        for state in job.states:
-            frames = job.views.render(state)
-            if (digest := artifacts.hash_arrays(*frames)) not in embeddings:
-                embeddings[digest] = embedder.embed_images(list(frames))
-            rows.append(embeddings[digest])
+    for state in job.states:
+        frames = job.views.render(state)
+        if (digest := artifacts.hash_arrays(*frames)) not in embeddings:
+            embeddings[digest] = embedder.embed_images(list(frames))
+        rows.append(embeddings[digest])
     return {"keys": job.states, "embeddings": np.stack(rows)}
 
 
@@ -76,17 +75,18 @@ class StateEmbedder:
         embedder: str,
         precision: Precision = "auto",
         *,
+        backend: Backend = "auto",
         device: str = "auto",
         n_workers: int | None = None,
         engine: Engine = "local",
     ) -> None:
         """Open the cache (created when something is first written); arguments as in `FrameEmbeddings`."""
-        network = shared_embedder(embedder, precision, device)
-        self.views, self.embedder = views, WorkerEmbedder(embedder, precision, device, network.fingerprint)
+        network = shared_embedder(embedder, precision, device, backend)
+        self.views, self.embedder = views, WorkerEmbedder(embedder, precision, device, backend, network.cache_key)
         self.n_workers, self.engine = n_workers, engine
         self.n_embedded = 0
         """States that were not in the cache."""
-        digest = artifacts.hash_json([views.fingerprint(), network.fingerprint])
+        digest = artifacts.hash_json([views.fingerprint(), network.cache_key])
         self.folder: Path = cache_folder("embeddings", digest[:20])
         self._form = (views.n_drawn, network.dim)
         self._where: dict[bytes, tuple[Path, int]] = {}

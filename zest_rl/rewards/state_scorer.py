@@ -35,7 +35,8 @@ class StateScorer:
         if scorer.views is None:
             raise ZestError("the frames of this scorer are no rendered states, so it cannot score states")
         config = scorer.config
-        return cls(scorer, StateEmbedder(scorer.views, config.embedder, config.precision, device=device, **options))
+        how = {"backend": config.backend, "device": device, **options}
+        return cls(scorer, StateEmbedder(scorer.views, config.embedder, config.precision, **how))
 
     @classmethod
     def build(

@@ -35,7 +35,7 @@ from zest_rl.runtime.privacy import masked
 
 PACKAGES = (
     "torch", "torchvision", "timm", "open_clip_torch", "transformers", "gymnasium", "gymnasium-robotics", "mujoco",
-    "minari", "h5py", "numpy", "scipy", "pillow", "safetensors",
+    "minari", "h5py", "numpy", "scipy", "pillow", "safetensors", "onnxruntime",
 )  # fmt: skip
 
 
