@@ -18,7 +18,7 @@ import torch
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator  # type: ignore[import-untyped]
 
-from zest_rl.agents import AGENTS, load_policy
+from zest_rl.agents import AGENTS, Agent, load_policy
 from zest_rl.agents.base import describe_data
 from zest_rl.agents.bc import BCConfig
 from zest_rl.agents.dt import DTConfig
@@ -77,7 +77,7 @@ def rows(run_dir: Path) -> list[dict[str, str]]:
         return [{k: v for k, v in row.items() if k != "updates_per_s"} for row in csv.DictReader(file)]
 
 
-@pytest.fixture(scope="module", params=sorted(AGENTS))
+@pytest.fixture(scope="module", params=sorted(name for name, agent in AGENTS.items() if isinstance(agent, Agent)))
 def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of each agent that nothing interrupted."""
     return start(tmp_path_factory.mktemp("whole") / request.param, request.param)
