@@ -178,17 +178,16 @@ def trainer(agent: str) -> Trainer:
     from zest_rl.agents import Agent, get_agent
     from zest_rl.training.loop import RunConfig, TrainingConfig
 
-    if isinstance(get_agent(agent), Agent):
-        from zest_rl.training.runs import train as train_on_data
+    learns_from_data = isinstance(get_agent(agent), Agent)
 
-        return Trainer(train_on_data, TrainingConfig, "updates")
-
-    def train_online(*args: Any, **kwargs: Any) -> Path:
-        from zest_rl.online.runs import train  # brings a simulator, which help does without
-
+    def train_run(*args: Any, **kwargs: Any) -> Path:
+        if learns_from_data:  # either brings a simulator, which help does without
+            from zest_rl.training.runs import train
+        else:
+            from zest_rl.online.runs import train
         return train(*args, **kwargs)
 
-    return Trainer(train_online, RunConfig, "steps")
+    return Trainer(train_run, *((TrainingConfig, "updates") if learns_from_data else (RunConfig, "steps")))
 
 
 def train(
