@@ -8,7 +8,6 @@ import itertools
 import json
 import os
 import re
-import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+from chromium import CHROMIUM
 from hypothesis import given
 from hypothesis import strategies as st
 from markupsafe import escape
@@ -61,9 +61,6 @@ from zest_rl.report.sections import (
 N_STEPS = 30
 FPS = 10.0
 GREY, GREY_PER_STEP = 40, 6
-CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""
-)
 
 
 def write_video(path: Path, codec: str = "libx264") -> Path:

@@ -77,13 +77,9 @@ def inspect(dataset_id: str) -> Inspection:
         states = None if views is None else ds.states()
         truth = ds.truth() if ds.has_truth else None
         suits_agents = ds.suits_agents
-    frames, still = None, None
-    if views is not None and states is not None:
-        rendered = [canonical_states(episode, views) for episode in states]
-        frames = [episode[1:] for episode in rendered]
-        still = [(episode[1:] == episode[0]).all(axis=1) for episode in rendered]
-    elif (record.scorer.features, record.scorer.similarity) == ("delta", "cos") and record.shuffle is None:
-        still = [episode[1:] == 0 for episode in scores]  # nothing else scores exactly 0
+    frames, still = (None, None) if views is None or states is None else rendered_frames(states, views)
+    if (record.scorer.features, record.scorer.similarity) == ("delta", "cos") and record.shuffle is None:
+        still = still or unchanged(scores)
     figures = measure_rewards(rewards, scores, frames, still, truth)
     warnings = reward_warnings(rewards, figures)
     if record.shuffle is not None:
@@ -104,6 +100,19 @@ def inspect(dataset_id: str) -> Inspection:
         states,
         suits_agents,
     )
+
+
+def rendered_frames(
+    states: Sequence[NDArray[np.float64]], views: Views
+) -> tuple[list[NDArray[np.float64]], list[NDArray[np.bool_]]]:
+    """Return of each episode (T+1, nq) the states after each action as they are rendered, and which equal the first."""
+    rendered = [canonical_states(episode, views) for episode in states]
+    return [episode[1:] for episode in rendered], [(episode[1:] == episode[0]).all(axis=1) for episode in rendered]
+
+
+def unchanged(scores: Sequence[FloatArray]) -> list[NDArray[np.bool_]]:
+    """Return which frames of each episode equal the first one, by their scores (T+1,) of cosines of changes."""
+    return [episode[1:] == 0 for episode in scores]  # nothing else scores exactly 0
 
 
 def _over_time(rewards: list[FloatArray], truth: list[GroundTruth] | None) -> dict[str, FloatArray]:

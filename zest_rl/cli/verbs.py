@@ -11,6 +11,7 @@ VERBS = {
     "relabel": "a dataset and a goal (pictures or sentences) → a dataset with ZeST rewards",
     "inspect": "a relabeled dataset → what its rewards are worth, before anything is trained on them",
     "curate": "a relabeled dataset → which episodes to drop, why, and a dataset without them",
+    "explore": "a dataset → a local page: drop pictures on it, see all episodes scored at once",
     "select": "datasets and a goal → does the goal find its frames (`goals`), `actions`, real `footage`?",
     "follow": "an episode that reaches several goals → its similarity to each of them over time",
     "export": "a dataset → a file that other offline-RL code reads",
@@ -48,6 +49,10 @@ USAGES = {
     "curate": Usage(
         ("keep", "dry_run", "source"),
         ("zest/kitchen-micro-noisy-zest-0a1b2c3d-v0 --dry-run", "zest/cups-zest-0a1b2c3d-v0 --source cups/ --keep 0.9"),
+    ),
+    "explore": Usage(
+        ("goal", "frames", "embedder", "port", "browser"),
+        ("zest/kitchen-micro-noisy-v0", "door/mine-v0 --frames observations/image --goal pictures/"),
     ),
     "select goals": Usage(
         ("task", "goal", "embedder", "top", "context"), ("zest/kitchen-micro-noisy-v0 --goal same-scene",)

@@ -23,7 +23,7 @@ import numpy as np
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen.tasks import RING, TASKS, Task
 from zest_rl.runtime import artifacts
-from zest_rl.runtime.gl import INSTALL_GL, select_gl_backend
+from zest_rl.runtime.gl import INSTALL_GL, cached_in_thread, select_gl_backend
 from zest_rl.simulation.rendering import Camera, StateRenderer
 from zest_rl.simulation.scene import Scene, compile_for_drawing, decimate
 from zest_rl.simulation.views import ring
@@ -114,9 +114,9 @@ def open_renderer(config: RenderConfig, cameras: tuple[Camera, ...]) -> StateRen
     return StateRenderer(Scene(_render_model(config), N_QPOS, relevant_qpos(config)), cameras, config.size)
 
 
-@functools.cache
+@cached_in_thread
 def shared_renderer(config: RenderConfig, cameras: tuple[Camera, ...]) -> StateRenderer:
-    """Return this process's renderer, open until the process ends; building one takes 0.5 s, or 2 s with the robot."""
+    """Return this thread's renderer, open until the process ends; building one takes 0.5 s, or 2 s with the robot."""
     renderer = open_renderer(config, cameras)
     atexit.register(renderer.close)  # left open, or closed after the GL library, it prints errors at exit
     return renderer

@@ -62,9 +62,18 @@ def value_order(scores: Sequence[FloatArray]) -> Estimate:
     1 is a score that rises at every step (Ma et al. 2024, https://arxiv.org/abs/2411.04549). Episodes whose scores are
     constant have no order and count as 0. Those of one step are left out; NaN if there are no others.
     """
+    return _against_time(scores, _rank_correlation, least=2)
+
+
+def order_in_time(score: FloatArray) -> float:
+    """Spearman's ρ of score (T,) and time in one episode, as in `value_order`; 0 for constant scores or one step."""
+    return 0.0 if np.ptp(score) == 0 else _rank_correlation(score, np.arange(len(score)))
+
+
+def _rank_correlation(score: FloatArray, time: NDArray[np.int_]) -> float:
     from scipy import stats
 
-    return _against_time(scores, lambda score, time: stats.spearmanr(score, time).statistic, least=2)
+    return float(stats.spearmanr(score, time).statistic)
 
 
 def share_explained_by_step(scores: Sequence[FloatArray]) -> Estimate:

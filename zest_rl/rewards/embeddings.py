@@ -56,6 +56,9 @@ class EpisodeEmbeddings(Protocol):
     def embed(self, on_progress: Callable[[int, int], None] | None = None) -> None:
         """Fill the cache; `on_progress` is called with (parts embedded, parts in all)."""
 
+    def read(self, episode: int) -> EmbeddedEpisode | None:
+        """Read one episode from the cache, into which another process may be writing; None: not all of it is there."""
+
     def __iter__(self) -> Iterator[EmbeddedEpisode]:
         """Read the cache, one episode in memory at a time."""
 

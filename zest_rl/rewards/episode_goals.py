@@ -57,7 +57,9 @@ def episode_goal(source: Source, episode: str | int) -> GoalSpec:
 
 def ends(frames: EpisodeFrames, episode: int) -> tuple[Sequence[Frame], Sequence[Frame]]:
     """Return the views of the first and of the last step of an episode."""
-    return frames.ends(episode) if isinstance(frames, RenderedFrames) else first_and_last(frames.read(episode))
+    if isinstance(frames, RenderedFrames):
+        return frames.at(episode, 0), frames.at(episode, -1)
+    return first_and_last(frames.read(episode))
 
 
 def first_and_last(steps: Iterator[Sequence[Frame]]) -> tuple[Sequence[Frame], Sequence[Frame]]:
@@ -88,8 +90,13 @@ def write_goal(dataset: str, episode: int, folder: Path, **frames: Any) -> tuple
         goal = GoalSpec(str(path), tuple(start), tuple(end))
     else:
         goal = episode_goal(open_source(dataset, **frames), episode)
+    write_pictures(folder, goal)
+    return folder, goal
+
+
+def write_pictures(folder: Path, goal: GoalSpec) -> None:
+    """Write a goal's pictures as ``init/`` and ``goal/``, as they are."""
     for part, pictures in (("init", goal.starts), ("goal", goal.goals)):
         (folder / part).mkdir(parents=True)
-        for view, picture in enumerate(pictures):
-            Image.fromarray(np.asarray(picture)).save(folder / part / f"{view}.png")
-    return folder, goal
+        for i, picture in enumerate(pictures):
+            Image.fromarray(np.asarray(picture)).save(folder / part / f"{i}.png")

@@ -81,6 +81,13 @@ def _embed_frame(shared: _Shared, place: tuple[int, int]) -> FloatArray:
     return shared.embedder.load().embed_images(list(next(islice(shared.frames.read(episode), step, None))))
 
 
+def _whole(frames: FloatArray, n_steps: int) -> EmbeddedEpisode:
+    """Return an episode of T or T + 1 embedded frames; a missing x_T repeats x_{T-1}."""
+    if len(frames) == n_steps:
+        frames = np.concatenate([frames, frames[-1:]])
+    return EmbeddedEpisode(frames, np.arange(n_steps + 1))
+
+
 class FrameEmbeddings:
     """The `EpisodeEmbeddings` of the frames of a source."""
 
@@ -161,7 +168,7 @@ class FrameEmbeddings:
         check_equal(self._folder, ((cached[name], vectors) for name, vectors in again))
 
     def __iter__(self) -> Iterator[EmbeddedEpisode]:
-        """Read the cache; a missing x_T repeats x_{T-1}.
+        """Read the cache.
 
         What turns out to be damaged is embedded again, in this process.
 
@@ -175,9 +182,12 @@ class FrameEmbeddings:
                 write_arrays(self._path(i), arrays)
                 self.n_embedded += 1
                 frames = arrays["embeddings"]
-            if len(frames) == n_steps:
-                frames = np.concatenate([frames, frames[-1:]])
-            yield EmbeddedEpisode(frames, np.arange(n_steps + 1))
+            yield _whole(frames, n_steps)
+
+    def read(self, episode: int) -> EmbeddedEpisode | None:
+        """Read the file of an episode."""
+        frames = self._read(episode)
+        return None if frames is None else _whole(frames, self._n_steps[episode])
 
     def _read(self, episode: int) -> FloatArray | None:
         """Return the embeddings of an episode's T or T + 1 frames, (n, V, D); None: not in the cache, or damaged."""

@@ -27,10 +27,15 @@ FRAME_OPTIONS = ("frames", "env", "robot", "look_at", "show_robot", "tolerance",
 
 def preview(path: Path, dataset: str, goal: str, **options: Any) -> int:
     """Draw what `zest_rl.rewards.relabel.relabel` would see with the same arguments; returns as `write_preview`."""
+    source = seen_source(dataset, **options)
+    return write_preview(path, source, read_source_goal(goal, source))
+
+
+def seen_source(dataset: str, **options: Any) -> Source:
+    """Open the episodes and frames that `zest_rl.rewards.relabel.relabel` scores with the same arguments."""
     frames = {name: options[name] for name in FRAME_OPTIONS if name in options}
     cameras, n_views = options.get("camera", ()), options.get("views", Views.n_views)
-    source = open_source(dataset, cameras=cameras, n_views=n_views, **frames)
-    return write_preview(path, source, read_source_goal(goal, source))
+    return open_source(dataset, cameras=cameras, n_views=n_views, **frames)
 
 
 def write_preview(path: Path, source: Source, goal: GoalSpec) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -19,13 +19,12 @@ from zest_rl.embedders import DEFAULT_EMBEDDER, Backend, Precision
 from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.views import Views
 from zest_rl.rewards.cards import dataset_card
-from zest_rl.rewards.embeddings import EpisodeEmbeddings
+from zest_rl.rewards.embeddings import EmbeddedEpisode, EpisodeEmbeddings
 from zest_rl.rewards.episode_goals import read_source_goal
 from zest_rl.rewards.frame_embeddings import FrameEmbeddings
 from zest_rl.rewards.scorer import SCORER_FILE, Scorer, ScorerConfig
 from zest_rl.rewards.scores import Features, Similarity
-from zest_rl.rewards.state_embeddings import StateEmbeddings
-from zest_rl.rewards.state_scorer import StateScorer
+from zest_rl.rewards.state_embeddings import StateEmbedder, StateEmbeddings
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.parallel import Engine
 from zest_rl.runtime.privacy import masked
@@ -210,10 +209,7 @@ def relabel_source(
         scores, n_still = scorer.score_episodes(embeddings)
         if shuffle is not None:
             scores = shuffled(scores, shuffle)
-        of_pictures = scorer.goal is not None and not scorer.goal.is_text
-        is_masked = isinstance(source.frames, KitchenStates | SceneStates | MaskedFrames)
-        one_camera = len(source.frames.views) == 1 and not is_masked and of_pictures
-        view_cannot_tell = one_camera and scorer.view_cannot_tell(embeddings)
+        cannot_tell = view_cannot_tell(scorer, source.frames, embeddings)
         record = RelabelRecord(
             source=trajectories.dataset_id,
             source_sha256=source_sha256,
@@ -223,7 +219,7 @@ def relabel_source(
             kept_goals=None if kept is None else tuple(kept.tolist()),
             scorer=scorer.record,
             n_still_frames=n_still,
-            view_cannot_tell=view_cannot_tell,
+            view_cannot_tell=cannot_tell,
             provenance=artifacts.provenance(),
         )
 
@@ -241,7 +237,7 @@ def relabel_source(
             zest={"relabel": record.to_json()},
             extra=add,
         )
-    return result(scorer, n_still, view_cannot_tell=view_cannot_tell)
+    return result(scorer, n_still, view_cannot_tell=cannot_tell)
 
 
 def _open(
@@ -249,12 +245,28 @@ def _open(
 ) -> tuple[Scorer, EpisodeEmbeddings]:
     """Build the scorer, and open the embeddings: of distinct states where frames are rendered from them."""
     frames = source.frames
-    options: dict[str, Any] = {"device": device, "n_workers": n_workers, "engine": engine}
     ring = frames.ring if isinstance(frames, KitchenStates) else None
     scorer = Scorer.build(config, read_source_goal(config.goal, source), views=ring, device=device)
-    if not isinstance(frames, KitchenStates):
-        return scorer, FrameEmbeddings(source, config.embedder, config.precision, backend=config.backend, **options)
-    return scorer, StateEmbeddings(StateScorer.of(scorer, **options).embedder, frames.states)
+    options: dict[str, Any] = {"device": device, "n_workers": n_workers, "engine": engine}
+    return scorer, open_embeddings(source, config.embedder, config.precision, backend=config.backend, **options)
+
+
+def open_embeddings(source: Source, embedder: str, precision: Precision = "auto", **options: Any) -> EpisodeEmbeddings:
+    """Open the embeddings of a dataset: of its distinct states in the kitchen, else of its frames.
+
+    Arguments and errors are those of `StateEmbedder` and `FrameEmbeddings`.
+    """
+    frames = source.frames
+    if isinstance(frames, KitchenStates):
+        return StateEmbeddings(StateEmbedder(frames.ring, embedder, precision, **options), frames.states)
+    return FrameEmbeddings(source, embedder, precision, **options)
+
+
+def view_cannot_tell(scorer: Scorer, frames: EpisodeFrames, episodes: Iterable[EmbeddedEpisode]) -> bool:
+    """Return `Scorer.view_cannot_tell` where there is one view, in which the robot is not hidden; else False."""
+    of_pictures = scorer.goal is not None and not scorer.goal.is_text
+    is_masked = isinstance(frames, KitchenStates | SceneStates | MaskedFrames)
+    return len(frames.views) == 1 and not is_masked and of_pictures and scorer.view_cannot_tell(episodes)
 
 
 def _write_scorer(folder: Path, scorer: Scorer, frames: EpisodeFrames) -> None:

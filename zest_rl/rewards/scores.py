@@ -106,9 +106,12 @@ def score_raw(frame_embeddings: FloatArray, goal_embeddings: FloatArray, similar
     Raises:
         BadInput: shapes do not fit, or a value is not finite.
     """
+    return _mean_over_goals(_raw(frame_embeddings, goal_embeddings, similarity))
+
+
+def _raw(frame_embeddings: FloatArray, goal_embeddings: FloatArray, similarity: Similarity) -> Doubles:
     frames = _check("frame_embeddings", frame_embeddings)
-    goals = _check("goal_embeddings", goal_embeddings, frames.shape[1])
-    return _mean_over_goals(_similarity(frames, goals, similarity))
+    return _similarity(frames, _check("goal_embeddings", goal_embeddings, frames.shape[1]), similarity)
 
 
 def pair_starts(starts: Doubles, goals: Doubles) -> NDArray[np.intp]:
@@ -146,8 +149,14 @@ def score_delta(
     Raises:
         BadInput: shapes do not fit, or a value is not finite.
     """
+    return _mean_over_goals(_delta(frame_embeddings, start_embeddings, goal_embeddings, similarity))
+
+
+def _delta(
+    frame_embeddings: FloatArray, start_embeddings: FloatArray, goal_embeddings: FloatArray, similarity: Similarity
+) -> Doubles:
     frames, goals, starts = _checked(frame_embeddings, start_embeddings, goal_embeddings)
-    return _mean_over_goals(_similarity(_change(frames, frames[0]), _change(goals, starts), similarity))
+    return _similarity(_change(frames, frames[0]), _change(goals, starts), similarity)
 
 
 def change_beside_goal(ends: FloatArray, starts: FloatArray, goals: FloatArray) -> tuple[float, float]:
@@ -198,6 +207,12 @@ def score_projection(
     """
     if not 0 <= alpha <= 1:
         raise BadInput(f"alpha must be in [0, 1], got {alpha}")
+    return _mean_over_goals(_projection(frame_embeddings, start_embeddings, goal_embeddings, alpha))
+
+
+def _projection(
+    frame_embeddings: FloatArray, start_embeddings: FloatArray, goal_embeddings: FloatArray, alpha: float
+) -> Doubles:
     frames, goals, starts = (_unit(rows) for rows in _checked(frame_embeddings, start_embeddings, goal_embeddings))
     similarities = []
     for goal, start in zip(goals, starts, strict=True):
@@ -206,7 +221,7 @@ def score_projection(
         along = np.outer(away @ way, way) / squared if squared > 0 else np.zeros_like(away)
         rest = alpha * along + (1 - alpha) * away
         similarities.append(1 - (rest**2).sum(axis=1) / 2)
-    return _mean_over_goals(np.stack(similarities, axis=1))
+    return np.stack(similarities, axis=1)
 
 
 def _progress(distances: Doubles) -> FloatArray:
@@ -216,12 +231,13 @@ def _progress(distances: Doubles) -> FloatArray:
     goals of different scales compare. Summed over views, so that a view that hardly shows the goal hardly counts.
 
     Args:
-        distances: (T+1,), summed or averaged over goals, summed over views.
+        distances: (T+1, …), summed or averaged over goals, summed over views.
 
     Returns:
-        (T+1,) float32; the first is 0, 1 is the goal.
+        (T+1, …) float32; the first is 0, 1 is the goal.
     """
-    return np.asarray((distances[0] - distances) / (distances[0] if distances[0] > 0 else 1.0), dtype=np.float32)
+    first = np.where(distances[0] > 0, distances[0], 1.0)
+    return np.asarray((distances[0] - distances) / first, dtype=np.float32)
 
 
 def score_classifier(
@@ -233,9 +249,13 @@ def score_classifier(
 
     Args, Returns, Raises: see `score_delta`; scores are in [0, 1].
     """
+    return _mean_over_goals(_classifier(frame_embeddings, start_embeddings, goal_embeddings))
+
+
+def _classifier(frame_embeddings: FloatArray, start_embeddings: FloatArray, goal_embeddings: FloatArray) -> Doubles:
     frames, goals, starts = _checked(frame_embeddings, start_embeddings, goal_embeddings)
     margin = LOGIT_SCALE * (_cos(frames, goals) - _cos(frames, starts))
-    return _mean_over_goals(1 / (1 + np.exp(-margin)))
+    return np.asarray(1 / (1 + np.exp(-margin)))
 
 
 def zero_deltas(frame_embeddings: FloatArray) -> NDArray[np.bool_]:
@@ -267,6 +287,23 @@ def score_views(
     Raises:
         BadInput: shapes do not fit, a value is not finite, or the names are unknown or do not go together.
     """
+    return averaged(similarities(frame_embeddings, start_embeddings, goal_embeddings, features, similarity), features)
+
+
+def similarities(
+    frame_embeddings: FloatArray,
+    start_embeddings: FloatArray,
+    goal_embeddings: FloatArray,
+    features: Features = "delta",
+    similarity: Similarity = "cos",
+) -> Doubles:
+    """Compare each view of each frame with each goal; `averaged` and `alone` make scores of this.
+
+    Args, Raises: see `score_views`.
+
+    Returns:
+        (V, T+1, K) float64; of ``"progress"``, minus the distances.
+    """
     frames = np.asarray(frame_embeddings)
     if frames.ndim != 3 or frames.shape[1] == 0:
         raise BadInput(f"frame_embeddings must have shape (T+1, V >= 1, D), got {frames.shape}")
@@ -275,18 +312,33 @@ def score_views(
         if goals.ndim == 3 and len(goals) != n_views:
             raise BadInput(f"{name} must hold one set for each of the {n_views} views, got {len(goals)}")
     check_names(features, similarity)
-    total = np.zeros(len(frames), dtype=np.float64)
+    compared = []
     for view in range(n_views):
         starts = start_embeddings[view] if start_embeddings.ndim == 3 else start_embeddings
         goals = goal_embeddings[view] if goal_embeddings.ndim == 3 else goal_embeddings
         if features == "delta":
-            total += score_delta(frames[:, view], starts, goals, similarity)
+            compared.append(_delta(frames[:, view], starts, goals, similarity))
         elif features == "raw":
-            total += score_raw(frames[:, view], goals, similarity)
+            compared.append(_raw(frames[:, view], goals, similarity))
         elif features == "projection":
-            total += score_projection(frames[:, view], starts, goals)
+            compared.append(_projection(frames[:, view], starts, goals, PROJECTED))
         elif features == "progress":
-            total -= score_raw(frames[:, view], goals, "l2")
+            compared.append(_raw(frames[:, view], goals, "l2"))
         else:
-            total += score_classifier(frames[:, view], starts, goals)
-    return _progress(total) if features == "progress" else np.asarray(total / n_views, dtype=np.float32)
+            compared.append(_classifier(frames[:, view], starts, goals))
+    return np.stack(compared)
+
+
+def averaged(compared: Doubles, features: Features) -> FloatArray:
+    """Average `similarities` (V, T+1, K) over goals and views: (T+1,) float32 scores."""
+    total = np.zeros(compared.shape[1], dtype=np.float64)
+    for view in compared:
+        total += _mean_over_goals(view)
+    return _progress(-total) if features == "progress" else np.asarray(total / len(compared), dtype=np.float32)
+
+
+def alone(compared: Doubles, features: Features) -> FloatArray:
+    """Return the scores by one view and one goal alone: `similarities` (V, T+1, K) → (V, T+1, K) float32."""
+    if features != "progress":
+        return np.asarray(compared, dtype=np.float32)
+    return np.swapaxes(_progress(-np.swapaxes(compared, 0, 1)), 0, 1)

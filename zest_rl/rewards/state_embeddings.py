@@ -140,6 +140,13 @@ class StateEmbedder:
         inverse = np.asarray(inverse).reshape(-1)
         return EmbeddedEpisode(np.concatenate([rows[inverse[:1]], rows]), 1 + inverse)
 
+    def known(self, states: NDArray[np.float64]) -> EmbeddedEpisode | None:
+        """As `embedded`; None where the cache does not hold all of the states, which are not embedded then."""
+        self._index_shards()
+        if any(key not in self._where for key in state_keys(self.views.canonical(states))):
+            return None
+        return self.embedded(states)
+
     def _row(self, key: bytes) -> FloatArray | None:
         """Return the (V, D) embeddings of a state, or None; a damaged shard is removed and forgotten."""
         if key in self._new:
@@ -226,6 +233,10 @@ class StateEmbeddings:
     def embed(self, on_progress: Callable[[int, int], None] | None = None) -> None:
         """Embed the states that are not in the cache."""
         self._embedder.embed(np.concatenate(list(self._states)), on_progress)
+
+    def read(self, episode: int) -> EmbeddedEpisode | None:
+        """Read the shards that hold the states of an episode."""
+        return self._embedder.known(self._states[episode])
 
     def __iter__(self) -> Iterator[EmbeddedEpisode]:
         return map(self._embedder.embedded, self._states)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import os
 import platform
 import subprocess
 import sys
-from typing import Any
+import threading
+from collections.abc import Callable, Hashable
+from typing import Any, Generic, TypeVar
 
 import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
 import mujoco
@@ -16,6 +19,26 @@ from zest_rl.errors import ZestError
 from zest_rl.runtime.address_space import GL, check_address_space
 
 INSTALL_GL = "apt-get install libegl1 libgl1 libosmesa6"
+Made = TypeVar("Made")
+
+
+class cached_in_thread(Generic[Made]):
+    """As `functools.cache`, for each thread its own: a GL context, and a simulation, belong to one thread."""
+
+    def __init__(self, make: Callable[..., Made]) -> None:
+        functools.update_wrapper(self, make)
+        self._make, self._of = make, threading.local()
+
+    def __call__(self, *arguments: Hashable) -> Made:
+        """Return what this thread made of these arguments."""
+        made: dict[tuple[Hashable, ...], Made] = vars(self._of).setdefault("made", {})
+        if arguments not in made:
+            made[arguments] = self._make(*arguments)
+        return made[arguments]
+
+    def cache_clear(self) -> None:
+        """Forget what this thread made."""
+        vars(self._of).clear()
 
 
 def select_gl_backend() -> str:
@@ -39,6 +62,12 @@ def select_gl_backend() -> str:
             os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = backend
             return backend
     raise ZestError(f"no frame can be rendered: neither EGL nor OSMesa works here; {INSTALL_GL}")
+
+
+def release_gl() -> None:
+    """Leave no GL context current in this thread, which ends: another may then draw with them, or close them."""
+    if os.environ.get("MUJOCO_GL") == "egl":
+        importlib.import_module("mujoco.egl").EGL.eglReleaseThread()
 
 
 def open_gl(model: mujoco.MjModel, size: int) -> tuple[Any, mujoco.MjrContext]:

@@ -35,10 +35,10 @@ class EpisodeFrames(Protocol):
 
 @runtime_checkable
 class RenderedFrames(Protocol):
-    """`EpisodeFrames` of which the last of an episode can be had without those before."""
+    """`EpisodeFrames` of which one of an episode can be had without those before."""
 
-    def ends(self, episode: int) -> tuple[Sequence[Frame], Sequence[Frame]]:
-        """Return the V frames of x_0, and those of x_T."""
+    def at(self, episode: int, step: int, view: int | None = None) -> Sequence[Frame]:
+        """Return the V frames of a step, or that of one view alone; step −1 is x_T."""
 
 
 class StateViews(Protocol):

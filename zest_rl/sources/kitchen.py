@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from zest_rl.data.reader import Dataset, open_dataset
 from zest_rl.data.writer import DatasetCopy
+from zest_rl.kitchen.scene import shared_renderer
 from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.runtime import artifacts
 from zest_rl.sources.base import Source
@@ -45,12 +46,12 @@ class KitchenStates:
         for state in canonical_states(self.states[episode], self.ring):
             yield list(renderer.render(state))
 
-    def ends(self, episode: int) -> tuple[Sequence[Frame], Sequence[Frame]]:
-        """Render x_0 and x_T."""
-        first, last = map(
-            self.ring.shared_renderer().render, canonical_states(self.states[episode][[0, -1]], self.ring)
-        )
-        return list(first), list(last)
+    def at(self, episode: int, step: int, view: int | None = None) -> Sequence[Frame]:
+        """Render one state."""
+        (state,) = canonical_states(self.states[episode][[step]], self.ring)
+        if view is None:
+            return self.ring.render(state)
+        return list(shared_renderer(self.ring.render_config, (self.ring.cameras[view],)).render(state))
 
 
 def kitchen_source(dataset_id: str, ring: Views) -> Source:

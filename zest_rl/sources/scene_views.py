@@ -6,7 +6,6 @@ recorded episodes.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Self
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.gl import cached_in_thread
 from zest_rl.runtime.records import from_json
 from zest_rl.simulation.bodies import Bodies, robot_bodies
 from zest_rl.simulation.framing import HIDDEN_GROUP, ObjectRing, Point, centre, object_geoms, seen_shares
@@ -68,15 +68,15 @@ class SceneStage:
         self._canvas.cameras = tuple(camera.to_mujoco() for camera in cameras)
 
 
-@functools.cache
+@cached_in_thread
 def shared_simulation(env_spec: str) -> Simulation:
-    """Return this process's environment, whose model is drawn by `SceneStage` alone."""
+    """Return this thread's environment, whose model is drawn by `SceneStage` alone."""
     return make_simulation(env_spec)
 
 
-@functools.cache
+@cached_in_thread
 def scene_stage(env_spec: str, hidden: tuple[int, ...]) -> SceneStage:
-    """Return this process's stage of an environment with these bodies hidden; raises as `make_simulation`."""
+    """Return this thread's stage of an environment with these bodies hidden; raises as `make_simulation`."""
     simulation = shared_simulation(env_spec)
     mask = np.zeros(simulation.model.nbody, bool)
     mask[list(hidden)] = True

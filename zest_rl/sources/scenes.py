@@ -87,10 +87,10 @@ class SceneStates:
                 frames = self._stage.render(row, cameras)
             yield frames
 
-    def ends(self, episode: int) -> tuple[Sequence[Frame], Sequence[Frame]]:
-        """Render x_0 and x_T."""
+    def at(self, episode: int, step: int, view: int | None = None) -> Sequence[Frame]:
+        """Render one state."""
         rows, cameras = self._placed(episode)
-        return self._stage.render(rows[0], cameras), self._stage.render(rows[-1], cameras)
+        return self._stage.render(rows[step], cameras if view is None else cameras[view : view + 1])
 
     def _placed(self, episode: int) -> tuple[Sequence[State], tuple[Camera, ...]]:
         """Return the states of an episode, and the cameras that look at where the body stands in the first."""

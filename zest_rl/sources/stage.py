@@ -25,6 +25,7 @@ import zest_rl.kitchen.env  # noqa: F401  # registers its environment, and those
 from zest_rl.data.env_specs import check_registered, is_maker, without_wrappers
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.gl import cached_in_thread
 from zest_rl.simulation.makers import make_named
 from zest_rl.simulation.recorder import DATA_FIELDS, MODEL_FIELDS
 from zest_rl.simulation.rendering import Canvas
@@ -134,9 +135,9 @@ class Stage:
         return list(self._canvas.draw(self.simulation.data))
 
 
-@functools.cache
+@cached_in_thread
 def stage_of(env_spec: str, cameras: tuple[str, ...]) -> Stage:
-    """Return this process's stage, open until the process ends.
+    """Return this thread's stage, open until the thread ends.
 
     Raises:
         BadInput: as `make_simulation`, or there is no such camera.
