@@ -1,7 +1,7 @@
 """Scores of episodes → which are worth keeping, and in words what is wrong with the others.
 
 An episode's **worth** is the mean of two numbers: its mean score, and the score of its last frame. The rule was chosen
-on development data (docs/findings.md); the other figures only say what is wrong with an episode.
+on development data (docs/curate.md); the other figures only say what is wrong with an episode.
 """
 
 from __future__ import annotations
