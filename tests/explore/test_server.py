@@ -74,7 +74,7 @@ def ask(client: TestClient, **changed: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize(
     "settings",
-    [{}, {"features": "progress", "reward": "difference"}, {"similarity": "l2", "goal_share": 0.5}],
+    [{"goal_share": 1}, {"features": "progress", "reward": "difference"}, {"similarity": "l2", "goal_share": 0.5}],
     ids=["delta", "progress", "half of the goals"],
 )
 def test_what_is_saved_are_the_scores_shown_and_the_very_dataset_of_the_command_that_is_printed(

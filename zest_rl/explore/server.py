@@ -13,7 +13,7 @@ import socket
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -297,7 +297,8 @@ async def _json(request: Request) -> dict[str, Any]:
 
 async def _ask(request: Request) -> Ask:
     try:
-        return from_json(Ask, await _json(request))
+        asked = from_json(Ask, await _json(request))
+        return replace(asked, goal_share=float(asked.goal_share))  # 1 and 1.0 have other hashes
     except TypeError as error:
         raise BadInput(f"this is no goal: {error}") from error
 
