@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeAlias, get_args, overload
 
 from zest_rl.errors import BadInput, nearest
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from zest_rl.export import Exported, Format
     from zest_rl.export.push import Upload
     from zest_rl.kitchen.collect import Collected
+    from zest_rl.rewards.by_learned import RelabeledByRun
     from zest_rl.rewards.relabel import Relabeled
     from zest_rl.training.loop import OnProgress
 
@@ -78,20 +79,40 @@ def collect(
     return collect_dataset(config, n_workers=n_workers, on_progress=on_progress or (lambda done, total: None))
 
 
-def relabel(dataset: AnyDataset, goal: str | Path = "same-scene", **flags: Any) -> Relabeled:
+@overload
+def relabel(
+    dataset: AnyDataset, goal: str | Path = ..., *, reward: Literal["level", "difference"] = ..., **flags: Any
+) -> Relabeled: ...
+
+
+@overload
+def relabel(dataset: AnyDataset, goal: str | Path = ..., *, reward: str | Path, **flags: Any) -> RelabeledByRun: ...
+
+
+def relabel(
+    dataset: AnyDataset, goal: str | Path = "same-scene", *, reward: str | Path = "level", **flags: Any
+) -> Relabeled | RelabeledByRun:
     """Write a copy of a dataset whose rewards are ZeST scores; see `zest_rl.rewards.relabel.relabel`.
 
     Args:
         dataset: any that `zest relabel` takes.
         goal: folder with ``init/`` and ``goal/``, "text:closed drawer -> open drawer", "episode:3", or for the kitchen
             "same-scene", "toys", "text" or "drawings".
+        reward: "level", the score after each action; "difference", its change; or what ``train("trex", …)`` returned,
+            whose learned rewards are written instead (`zest_rl.rewards.by_learned.relabel_by_run`).
         **flags: frames, camera, env, robot, look_at, views, show_robot, tolerance, skip_incomplete, masks, embedder,
-            features, similarity, precision, backend, goal_share, reward, shuffle, device, n_workers, engine, on_start,
-            on_progress. What `zest relabel --preview` draws, `zest_rl.rewards.preview.preview` draws.
+            features, similarity, precision, backend, goal_share, shuffle, device, n_workers, engine, on_start,
+            on_progress; of a learned reward device, n_workers and engine. What `zest relabel --preview` draws,
+            `zest_rl.rewards.preview.preview` draws.
     """
+    from zest_rl.rewards.by_learned import relabel_by_run
     from zest_rl.rewards.relabel import relabel as relabel_dataset
+    from zest_rl.rewards.scores import Reward, check_reward
 
-    return relabel_dataset(_id(dataset), str(goal), **flags)
+    check_reward(str(reward))
+    if str(reward) not in get_args(Reward):
+        return relabel_by_run(_id(dataset), reward, **flags)
+    return relabel_dataset(_id(dataset), str(goal), reward=reward, **flags)
 
 
 def with_rewards(dataset: AnyDataset, rewards: Sequence[ArrayLike], label: str = "given") -> str:
@@ -203,7 +224,7 @@ def train(
     See `zest_rl.training.runs.train`, and for sac, ppo and trpo `zest_rl.online.runs.train`.
 
     Args:
-        agent: bc, dt or rvs; sac, ppo or trpo, which learn in the dataset's environment.
+        agent: bc, dt or rvs; trex, which learns a reward; sac, ppo or trpo, which learn in the dataset's environment.
         dataset: its rewards are the only information about quality.
         run_dir: folder of this run alone; default ``runs/DATASET-AGENT-seedN``.
         on_progress: called after every logged row.

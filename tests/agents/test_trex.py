@@ -21,7 +21,7 @@ from zest_rl.runtime import artifacts
 from zest_rl.training.loop import TrainingConfig, fit
 from zest_rl.types import Episode, FloatArray
 
-SMALL = trex.TREXConfig(snippet_len=8, hidden_size=16, batch_size=16, learning_rate=3e-3, warmup_updates=10)
+SMALL = trex.TREXConfig(snippet_len=8, n_layers=1, hidden_size=16, weight_decay=0.01, warmup_updates=10)
 
 
 def walks(n: int = 30, *, seed: int = 0, shuffle: bool = False) -> list[Episode]:

@@ -236,9 +236,10 @@ class ReturnToGo:
 def mlp(n_inputs: int, hidden_size: int, n_layers: int, n_outputs: int, dropout: float) -> nn.Sequential:
     """Return linear, ReLU and dropout for each hidden layer, then a linear layer and tanh: [batch, n_outputs]."""
     layers: list[nn.Module] = []
-    for width in [n_inputs, *[hidden_size] * (n_layers - 1)]:
+    widths = [n_inputs, *[hidden_size] * n_layers]
+    for width in widths[:-1]:
         layers += [nn.Linear(width, hidden_size), nn.ReLU(), nn.Dropout(dropout)]
-    return nn.Sequential(*layers, nn.Linear(hidden_size, n_outputs), nn.Tanh())
+    return nn.Sequential(*layers, nn.Linear(widths[-1], n_outputs), nn.Tanh())
 
 
 def networks_of(model: nn.Module) -> list[nn.Module]:

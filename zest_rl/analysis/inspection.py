@@ -168,6 +168,6 @@ def _settings(inspection: Inspection) -> dict[str, Any]:
         "similarity": scorer.similarity,
         "views": record.n_views,
         "share of goals": scorer.goal_share,
-        "reward": record.reward,
+        "reward": record.reward if record.learned is None else f"learned of {record.learned['inputs']}",
         "shuffled": "no" if record.shuffle is None else record.shuffle,
     }

@@ -59,9 +59,8 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
 
     ui = ui if launched().leads else SilentUi()
     agent_config, training = split_config(config)
-    run_dir = config.run_dir or default_run_dir(config.agent, config.dataset, training.seed)
+    how, run_dir = trainer(config.agent), config.run_dir or default_run_dir(config.agent, config.dataset, training.seed)
     ui.say(f"training in {run_dir}")
-    how = trainer(config.agent)
     with ui.progress(f"{config.agent} {how.counts}", getattr(config, f"n_{how.counts}")) as advance:
 
         def show(n: int, **row: float) -> None:
@@ -70,10 +69,12 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
         how.train(config.agent, config.dataset, agent_config, training, run_dir=run_dir, on_progress=show)
     if not launched().leads:
         return {}
-    meta = artifacts.read_json(run_dir / "meta.json")
-    evaluable = is_evaluable(DatasetRecord.of_run(meta))
+    meta, folder = artifacts.read_json(run_dir / "meta.json"), shlex.quote(str(run_dir))
+    following = f"evaluate {folder}" if is_evaluable(DatasetRecord.of_run(meta)) else f"export {config.dataset}"
+    learned, is_reward = f"relabel {config.dataset} --reward {folder}", config.agent == "trex"
     return {
         "run": str(run_dir),
         **{key: meta[key] for key in ("agent", "n_params", "n_updates", "train_seconds")},
-        "next": f"zest evaluate {shlex.quote(str(run_dir))}" if evaluable else f"zest export {config.dataset}",
+        **meta.get("held_out", {}),
+        "next": f"zest {learned if is_reward else following}",
     }

@@ -103,6 +103,9 @@ class RelabelRecord:
     frames_sha256: str | None = None
     view_cannot_tell: bool = False
     """See `zest_rl.rewards.scorer.Scorer.view_cannot_tell`; only of one view in which the robot is not hidden."""
+    learned: Mapping[str, Any] | None = None
+    """The rewards are those that T-REX learned from these scores' ranking (`zest_rl.rewards.learned`): the run's
+    identity, by ``ranked`` (dataset), ``inputs``, ``sha256``, ``held_out``. None: they are the scores themselves."""
     provenance: Mapping[str, Any] | None = None
     """Command, versions and machine; left out of a run's ``meta.json``."""
 
@@ -128,6 +131,7 @@ class RelabelRecord:
         """The record as a dataset's metadata hold it."""
         frames = {} if self.frames is None else {"frames": dict(self.frames), "frames_sha256": self.frames_sha256}
         of_view = {"view_cannot_tell": True} if self.view_cannot_tell else {}
+        learned = {} if self.learned is None else {"learned": dict(self.learned)}
         provenance = {} if self.provenance is None else {"provenance": dict(self.provenance)}
         return {
             "source": self.source,
@@ -139,6 +143,7 @@ class RelabelRecord:
             "scorer": self.scorer.to_json(),
             "n_still_frames": self.n_still_frames,
             **of_view,
+            **learned,
             **provenance,
         }
 

@@ -5,7 +5,6 @@ All policies get the same starts (paired seeds). Episodes run in parts, one part
 
 from __future__ import annotations
 
-import functools
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -20,12 +19,11 @@ from zest_rl.agents import Policy, load_policy
 from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput, Notice, nearest
 from zest_rl.evaluation.environments import KITCHEN, MAX_HORIZON, RunEnvironment, find_environment
+from zest_rl.evaluation.online import check_online, load_online
 from zest_rl.evaluation.rollout import Rtg, Traces, run_episodes, uses_online_scores
 from zest_rl.evaluation.videos import episode_video
 from zest_rl.kitchen.scene import N_QPOS
 from zest_rl.metrics.statistics import bootstrap, iqm, normalized_return, representative, wilson
-from zest_rl.rewards.scorer import SCORER_FILE, check_scorer
-from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.hub import local_run
 from zest_rl.runtime.parallel import cached_jobs, chunks, one_thread, read_parts
@@ -152,19 +150,13 @@ def target_return(policy: Policy, config: EvaluationConfig) -> float | None:
     return float(np.interp(config.target_quantile, np.linspace(0, 1, len(quantiles)), quantiles))
 
 
-@functools.lru_cache(maxsize=2)
-def _scorer(path: Path, sha256: str) -> StateScorer:
-    """Load a scorer once per process; a changed file has another `sha256`."""
-    return StateScorer.load(path, n_workers=1)
-
-
 _Job = tuple[Path, EvaluationConfig, RunEnvironment, range, bool, str]
 
 
 def _evaluate_part(job: _Job) -> Traces:
     run, config, environment, seeds, scored, device = job
     policy = load_policy(run, device=device)
-    scorer = _scorer(run / SCORER_FILE, artifacts.hash_file(run / SCORER_FILE)) if scored else None
+    online = load_online(run) if scored else {}
     with one_thread():
         arrays = run_episodes(
             policy,
@@ -172,10 +164,10 @@ def _evaluate_part(job: _Job) -> Traces:
             environment=environment,
             rtg=config.rtg,
             target_return=target_return(policy, config),
-            scorer=scorer,
+            **online,
         )
-    if scorer is not None:
-        scorer.flush()
+    if "scorer" in online:
+        online["scorer"].flush()
     return arrays
 
 
@@ -215,21 +207,8 @@ def evaluate(
     dataset = DatasetRecord.of_run(policy.meta)
     environment = find_environment(policy.meta, env=config.env, horizon=config.horizon, success_key=config.success_key)
     scored = score or uses_online_scores(policy, config.rtg)
-    if scored and not (run / SCORER_FILE).exists():
-        reason = "it was not trained on a relabeled dataset; use --rtg constant, or train on what `zest relabel` writes"
-        if dataset.is_foreign:
-            reason = (
-                "its frames are from elsewhere, so scores cannot be made online; use --rtg schedule or constant "
-                "(recorded states, relabeled without --frames and --camera, could be scored)"
-            )
-        if dataset.given is not None:
-            reason = (
-                f"its rewards ({dataset.given.label}) were given as numbers, and new states have none; use --rtg "
-                "schedule or constant, or act with zest_rl.load_policy and your own rewards"
-            )
-        raise BadInput(f"scores are needed, but {run.name} has no {SCORER_FILE}: {reason}")
     if scored:
-        check_scorer(run / SCORER_FILE, trust=trust)
+        check_online(run, dataset, trust=trust)
     folder, jobs = evaluation_folder(run, config), _jobs(run, config, environment, scored, device)
     minimum, expert = _references(dataset, policy.meta, config, environment)
     with artifacts.lock(folder):

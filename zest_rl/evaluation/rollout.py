@@ -1,7 +1,8 @@
-"""Policy + environment (+ scorer for the online return-to-go) → traces of N episodes, run in lockstep.
+"""Policy + environment (+ what rewards new states, for the online return-to-go) → traces of N episodes in lockstep.
 
-The return-to-go that a policy is conditioned on falls by the *online ZeST score* of each new state, in the units of its
-training rewards. Ground-truth rewards are recorded; only a policy that was trained on them gets them.
+The return-to-go that a policy is conditioned on falls by the *online ZeST score* of each new state, or by the learned
+reward of each new observation, in the units of its training rewards. Ground-truth rewards are recorded; only a policy
+that was trained on them gets them.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from zest_rl.agents import Policy
 from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.evaluation.environments import RunEnvironment, act_in, find_environment
+from zest_rl.rewards.learned import LearnedReward
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.types import FloatArray
 
@@ -37,6 +39,7 @@ def run_episodes(
     rtg: Rtg = "online",
     target_return: float | None = None,
     scorer: StateScorer | None = None,
+    reward: LearnedReward | None = None,
 ) -> Traces:
     """Run one episode per seed.
 
@@ -48,6 +51,7 @@ def run_episodes(
             upper bound of the comparison.
         target_return: the return that a policy is asked for, if it uses returns.
         scorer: scores each new state; needed for ``rtg="online"`` with ZeST rewards.
+        reward: in its place, a learned reward of observations, for a policy that was trained on it.
 
     Returns:
         gt_reward (N, T+1) float32; gt_success (N, T+1) bool where the environment tells it; the parts of the state that
@@ -58,7 +62,7 @@ def run_episodes(
     Raises:
         BadInput: as `find_environment`, or the policy needs scores and there is no scorer.
     """
-    if scorer is None and uses_online_scores(policy, rtg):
+    if scorer is None and reward is None and uses_online_scores(policy, rtg):
         raise BadInput(
             "the policy was not trained on rewards of the environment, so rtg 'online' needs a scorer; give it, or use "
             "'constant'"
@@ -70,7 +74,9 @@ def run_episodes(
     observations = [first for first, _ in resets]
     told = [environment.tell(env, None, info) for env, (_, info) in zip(envs, resets, strict=True)]
     trace, scores = [_stacked(told)], list[FloatArray]()
-    if scorer is not None:
+    if reward is not None:
+        scores.append(reward.of_obs(environment.flatten(observations)))
+    elif scorer is not None:
         views = scorer.embedder.views
         starts = np.stack([views.read(env.unwrapped, None) for env in envs])
         scores.append(scorer.score_now(starts, starts))
@@ -91,9 +97,11 @@ def run_episodes(
             trace.append(_stacked(told))
             for i in np.flatnonzero(n_steps == step + 1):
                 told[i] = {name: part * (not name.startswith("gt_")) for name, part in told[i].items()}
-            if scorer is not None:
+            if scores:
                 scores.append(np.zeros(len(envs), np.float32))
-                if len(running):
+                if reward is not None and len(running):
+                    scores[-1][running] = reward.of_obs(environment.flatten([observations[i] for i in running]))
+                elif scorer is not None and len(running):
                     states = np.stack([views.read(envs[i].unwrapped, starts[i]) for i in running])
                     scores[-1][running] = scorer.score_now(starts[running], states)
                 difference = relabel is not None and relabel.reward == "difference"
@@ -105,7 +113,7 @@ def run_episodes(
         for env in envs:
             env.close()
     arrays = {name: np.stack([step[name] for step in trace], axis=1) for name in trace[0]} | results_of_policy
-    if scorer is not None:
+    if scores:
         arrays["score"] = np.stack(scores, axis=1)
     return arrays if environment.is_kitchen else arrays | {"n_steps": n_steps}
 

@@ -34,7 +34,7 @@ from zest_rl.errors import BadInput, Notice, ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.cache import cache_folder
 from zest_rl.runtime.files import check_file
-from zest_rl.runtime.hub import RUN_FILES, SCORER_FILE, check_repo_id, hub_errors
+from zest_rl.runtime.hub import REWARD_FILES, RUN_FILES, SCORER_FILE, check_repo_id, hub_errors
 from zest_rl.runtime.privacy import masked
 from zest_rl.runtime.records import reading_record
 
@@ -192,7 +192,7 @@ def _goal_pictures_to_leave_out(record: DatasetRecord, names: Iterable[str], ask
 def _hide(paths: Mapping[str, Path]) -> dict[str, bytes]:
     """Return, of the files that name folders of this machine or hold secrets, the content without these."""
     hidden = {}
-    for name in (METADATA_FILE, "meta.json"):
+    for name in (METADATA_FILE, "meta.json", REWARD_FILES[0]):
         if name in paths:
             value = artifacts.read_json(paths[name])
             if masked(value) != value:

@@ -85,7 +85,8 @@ def read_meta(run: Path) -> dict[str, Any]:
 
 def goal_name(relabel: RelabelRecord) -> str:
     """Return a short name of the goal of a relabeled dataset."""
-    return Path(relabel.scorer.goal).name
+    name = Path(relabel.scorer.goal).name
+    return name if relabel.learned is None else f"T-REX by {name}"
 
 
 def _short_name(meta: dict[str, Any]) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 import safetensors.numpy
 
 from zest_rl.data.observations import standardized
+from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.hub import local_run
@@ -26,9 +27,6 @@ Inputs = Literal["obs", "embeddings"]
 
 TREX = "trex"
 """Name of the algorithm in ``meta.json``."""
-FILES = ("meta.json", "model.safetensors")
-"""What a run must hold to be a reward."""
-
 Layer = tuple[FloatArray, FloatArray]
 """Weights (n_out, n_in) and biases (n_out,)."""
 
@@ -54,7 +52,7 @@ class LearnedReward:
             ZestError: the weights differ from those that ``meta.json`` names.
         """
         run_dir = local_run(run_dir)
-        meta_file, weights_file = (run_dir / name for name in FILES)
+        meta_file, weights_file = run_dir / "meta.json", run_dir / "model.safetensors"
         if not meta_file.exists():
             raise BadInput(f"{run_dir} holds no learned reward; give the folder of a finished `zest train trex`")
         meta = artifacts.read_json(meta_file)
@@ -69,6 +67,21 @@ class LearnedReward:
             if {len(meta["obs_mean"]), len(meta["obs_std"]), *n_inputs} != {meta["obs_dim"]}:
                 raise ValueError(f"its inputs are not those of {weights_file.name}")
         return cls(meta, networks)
+
+    @property
+    def record(self) -> DatasetRecord:
+        """The dataset whose trajectories were ranked.
+
+        Raises:
+            BadInput: the run does not say which.
+        """
+        return DatasetRecord.of_run(self.meta)
+
+    @property
+    def sha256(self) -> str:
+        """Hash of everything that a reward depends on besides its inputs."""
+        facts = [self.meta[name] for name in ("model_sha256", "obs_mean", "obs_std")]
+        return artifacts.hash_json([self.inputs, *facts])
 
     @property
     def inputs(self) -> Inputs:

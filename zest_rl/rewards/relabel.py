@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, get_args
 
 import numpy as np
 from PIL import Image
@@ -23,7 +23,7 @@ from zest_rl.rewards.embeddings import EmbeddedEpisode, EpisodeEmbeddings
 from zest_rl.rewards.episode_goals import read_source_goal
 from zest_rl.rewards.frame_embeddings import FrameEmbeddings
 from zest_rl.rewards.scorer import SCORER_FILE, Scorer, ScorerConfig
-from zest_rl.rewards.scores import Features, Similarity
+from zest_rl.rewards.scores import Features, Reward, Similarity
 from zest_rl.rewards.state_embeddings import StateEmbedder, StateEmbeddings
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.parallel import Engine
@@ -33,7 +33,6 @@ from zest_rl.sources.masked import MaskedFrames
 from zest_rl.sources.scenes import SceneStates
 from zest_rl.types import FloatArray
 
-Reward = Literal["level", "difference"]
 MAX_THUMBNAILS, THUMBNAIL = 8, 160
 """Number of start pictures and of goal pictures kept for reports, and their longer side in pixels."""
 
@@ -77,7 +76,7 @@ def rewards_from_scores(scores: FloatArray, reward: Reward = "level") -> FloatAr
         return scores[1:]
     if reward == "difference":
         return np.diff(scores)
-    raise BadInput(f"unknown reward {reward!r}; {nearest(reward, ('level', 'difference'))}")
+    raise BadInput(f"unknown reward {reward!r}; {nearest(reward, get_args(Reward))}")
 
 
 def shuffled(scores: Sequence[FloatArray], seed: int) -> list[FloatArray]:

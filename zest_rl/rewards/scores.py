@@ -12,12 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.errors import BadInput, nearest
+from zest_rl.runtime.files import user_path
+from zest_rl.runtime.hub import SCHEME
 from zest_rl.types import FloatArray
 
 Doubles = NDArray[np.float64]
 Features = Literal["raw", "delta", "projection", "progress", "classifier"]
 """The first two are the paper's; the others are rewards to compare with, each with a similarity of its own."""
 Similarity = Literal["cos", "l2"]
+Reward = Literal["level", "difference"]
 PROJECTED = 0.5
 """Default α of `score_projection`."""
 LOGIT_SCALE = 100.0
@@ -41,6 +44,19 @@ def check_names(features: str, similarity: str) -> None:
         raise BadInput(f"unknown similarity {similarity!r}; {nearest(similarity, get_args(Similarity))}")
     if similarity != "cos" and features not in ("delta", "raw"):
         raise BadInput(f"features {features!r} bring a similarity of their own, got {similarity!r}; leave it at 'cos'")
+
+
+def check_reward(reward: str) -> None:
+    """Check what becomes of scores: the name of a `Reward`, or the folder of a learned one, here or on the hub.
+
+    Raises:
+        BadInput: it is neither.
+    """
+    if reward not in get_args(Reward) and not reward.startswith(SCHEME) and not user_path(reward).is_dir():
+        raise BadInput(
+            f"unknown reward {reward!r}, and there is no folder of that name; {nearest(reward, get_args(Reward))}, or "
+            "a folder that `zest train trex` left"
+        )
 
 
 def check_goal_share(share: float) -> None:

@@ -17,7 +17,10 @@ from zest_rl.runtime.cache import cache_folder
 SCHEME = "hf://"
 SCORER_FILE = "zest_scorer.safetensors"
 """Name of a scorer's file in a dataset that it relabeled, and in the runs that were trained on it."""
-RUN_FILES = ("meta.json", "model.safetensors", SCORER_FILE, "README.md")
+REWARD_FOLDER = "reward"
+"""Folder of a learned reward, a copy of its own run, in a dataset that it relabeled and in the runs trained on that."""
+REWARD_FILES = (f"{REWARD_FOLDER}/meta.json", f"{REWARD_FOLDER}/model.safetensors")
+RUN_FILES = ("meta.json", "model.safetensors", SCORER_FILE, *REWARD_FILES, "README.md")
 """What a run consists of on the hub; all that is fetched of one. Nothing in them runs."""
 _ADVICE = {
     401: "the token is missing or not valid; run `hf auth login`, or set HF_TOKEN",

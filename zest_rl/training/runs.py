@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,11 @@ from typing import Any
 from zest_rl.agents import get_agent
 from zest_rl.data.folders import CARD_FILE
 from zest_rl.data.reader import Dataset, open_dataset
+from zest_rl.rewards.by_learned import embeddings_of
 from zest_rl.rewards.cards import policy_card
 from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.hub import REWARD_FILES
 from zest_rl.training.checkpoints import snapshots
 from zest_rl.training.distributed import launched
 from zest_rl.training.loop import OnProgress, TrainingConfig, fit
@@ -47,8 +50,11 @@ def train(
     config = TrainingConfig() if config is None else config
     with open_dataset(dataset_id) as dataset:
         episodes, meta, files = dataset.episodes(), {"dataset": dataset.describe()}, scorer_files(dataset)
+        agent_config = get_agent(agent).config() if agent_config is None else agent_config
+        if getattr(agent_config, "inputs", "obs") == "embeddings":
+            embeddings = embeddings_of(dataset, dataset.path / SCORER_FILE, device=config.device)
+            episodes = [replace(e, obs=seen.mean(axis=1)) for e, seen in zip(episodes, embeddings, strict=True)]
     run_dir = run_dir or default_run_dir(agent, dataset_id, config.seed)
-    agent_config = get_agent(agent).config() if agent_config is None else agent_config
     fit(agent, agent_config, episodes, run_dir, config, meta=meta, files=files, on_progress=on_progress)
     if launched().leads:
         for folder, (name, content) in product((run_dir, *snapshots(run_dir)), files.items()):
@@ -65,6 +71,6 @@ def default_run_dir(label: str, dataset_id: str, seed: int) -> Path:
 
 
 def scorer_files(dataset: Dataset) -> dict[str, bytes]:
-    """Return the files that a run needs for online scores: name → content; none if the dataset has no scorer."""
-    path = dataset.path / SCORER_FILE
-    return {SCORER_FILE: path.read_bytes()} if path.exists() else {}
+    """Return the files that a run needs for online rewards: name → content; none if the dataset has no scorer."""
+    names = [name for name in (SCORER_FILE, *REWARD_FILES) if (dataset.path / name).exists()]
+    return {name: (dataset.path / name).read_bytes() for name in names}

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from zest_rl.cli.arguments import words_of
 from zest_rl.cli.relabel.arguments import Config
+from zest_rl.cli.relabel.learned import by_run
 from zest_rl.cli.ui import Ui, progress_in_parts
+from zest_rl.rewards.scores import Reward
 
 if TYPE_CHECKING:
     from zest_rl.sources import Source
@@ -43,6 +45,8 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         shown = preview(config.preview, **options)
         command = shlex.join(["zest", "relabel", *words_of(replace(config, preview=None))])
         return {"preview": str(config.preview), "episode": shown, "next": command}
+    if config.reward not in get_args(Reward):
+        return by_run(config, ui)
     started = time.monotonic()
     with progress_in_parts(ui, "embedding frames") as on_progress:
         relabeled = relabel(**options, on_start=tell, on_progress=on_progress)

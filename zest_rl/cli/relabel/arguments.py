@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from zest_rl.rewards.scores import Features, Similarity, check_goal_share, check_names
+from zest_rl.rewards.scores import Features, Similarity, check_goal_share, check_names, check_reward
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,9 @@ class Config:
     similarity, the share of the distance to the goal that is covered, a classifier of goal against start."""
     similarity: Similarity = "cos"
     """Cosine, or minus the Euclidean distance."""
-    reward: Literal["level", "difference"] = "level"
-    """The score after each action, or its change (an ablation)."""
+    reward: str = "level"
+    """level, the score after each action; difference, its change (an ablation); or the folder of a run of `zest train
+    trex`, whose learned rewards are written: then neither goal nor embedder is used."""
     goal_share: float = 1.0
     """Share of the goal pictures to use: those that the dataset's episodes end nearest to."""
     shuffle: int | None = None
@@ -75,4 +76,5 @@ class Config:
 
     def __post_init__(self) -> None:
         check_names(self.features, self.similarity)
+        check_reward(self.reward)
         check_goal_share(self.goal_share)
