@@ -24,8 +24,8 @@ ROOMS = (
 """The pipeline: a module imports only from its own room and from those before it."""
 
 MAY_READ_GROUND_TRUTH = (
-    "export.transitions", "analysis.curation_quality", "analysis.inspection", "report.comparison_page", "report.goals",
-    "explore.session",
+    "analysis.curation_quality", "analysis.inspection", "analysis.learned_rewards", "explore.session",
+    "export.transitions", "report.comparison_page", "report.goals",
 )  # fmt: skip
 """The only callers of `Dataset.truth`, which make reports or copies: nothing that chooses or trains anything."""
 

@@ -70,7 +70,7 @@ class TREXConfig(OptimizerConfig):
     """Pairs per update."""
     learning_rate: float = 3e-3
     """AdamW's step size after warm-up."""
-    weight_decay: float = 3.0
+    weight_decay: float = 10.0
     """AdamW's decoupled weight decay."""
     amp: Precision = "fp32"
     """Precision of matrix products; auto is bf16 where the hardware has it."""

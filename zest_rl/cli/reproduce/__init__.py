@@ -1,6 +1,6 @@
 """``zest reproduce``: a recipe → collected and relabeled datasets, trained and evaluated methods, tables and reports.
 
-What a recipe may hold is drawn in `comparison`, and in `study` for what trains nothing; with a key
+What a recipe may hold is drawn in `comparison`, in `study` for what trains nothing, and in `reward_study`; with a key
 ``verb = "follow …"`` or ``"select …"`` it holds the arguments of that verb. Cells run side by side, one core each; a
 finished cell is run again only if that is asked, because different code made it (`code`).
 """
@@ -18,9 +18,10 @@ import tyro
 
 from zest_rl.cli import follow, inspect, select
 from zest_rl.cli.config import load_config, read_recipe, recipe_path
-from zest_rl.cli.reproduce import study_tables, tables
+from zest_rl.cli.reproduce import reward_study, study_tables, tables
 from zest_rl.cli.reproduce.comparison import read_comparison
 from zest_rl.cli.reproduce.pipeline import run_comparison
+from zest_rl.cli.reproduce.reward_study import read_reward_study, run_reward_study
 from zest_rl.cli.reproduce.study import read_study, run_study
 from zest_rl.cli.ui import SilentUi, Ui
 from zest_rl.errors import BadInput
@@ -93,6 +94,8 @@ def reproduce(
     work: Callable[[], dict[str, Any]]
     if recipe.get("verb") in VERBS:
         work = _verb(recipe, f"recipe {file}", output, ui, n_workers)
+    elif recipe.get("study") == "trex":
+        work = partial(run_reward_study, read_reward_study(file), output, ui, n_workers=n_workers)
     elif "study" in recipe:
         work = partial(run_study, read_study(file), output, ui, n_workers=n_workers)
     else:
@@ -132,6 +135,8 @@ def _run_verb(module: Any, config: Any, output: Path, ui: Ui) -> dict[str, Any]:
 
 def summary(result: Mapping[str, Any]) -> str:
     """The tables as text."""
+    if result.get("study") == "trex":
+        return reward_study.as_text(result)
     if "study" in result:
         return study_tables.as_text(result)
     for key, verb in (("goals_against_tasks", inspect), ("follow", follow), ("select", select)):
