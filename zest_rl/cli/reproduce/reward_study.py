@@ -73,7 +73,7 @@ def read_reward_study(path: Path) -> RewardStudy:
 
     where = f"recipe {path}"
     tables = load_config(RewardTables, read_recipe(path), where)
-    relabels, trainings = {}, {}
+    relabels, trainings = {}, dict[str, Table]()
     for name, table in tables.rankings.items():
         flags = {**tables.relabel, **checked_table(table, f"{where} [rankings.{name!r}]", "dataset")}
         relabels[name] = load_config(relabel.Config, {**flags, "dataset": "of the task"}, where)
