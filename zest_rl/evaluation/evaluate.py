@@ -156,7 +156,7 @@ _Job = tuple[Path, EvaluationConfig, RunEnvironment, range, bool, str]
 def _evaluate_part(job: _Job) -> Traces:
     run, config, environment, seeds, scored, device = job
     policy = load_policy(run, device=device)
-    online = load_online(run) if scored else {}
+    online = load_online(run, DatasetRecord.of_run(policy.meta)) if scored else {}
     with one_thread():
         arrays = run_episodes(
             policy,

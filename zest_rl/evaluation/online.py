@@ -22,11 +22,15 @@ class OnlineReward(TypedDict, total=False):
     reward: LearnedReward
 
 
-def load_online(run: Path) -> OnlineReward:
+def load_online(run: Path, dataset: DatasetRecord) -> OnlineReward:
     """Load what the run holds, which `check_online` accepted."""
-    if (run / REWARD_FOLDER).exists():
+    if _is_learned(dataset):
         return {"reward": LearnedReward.load(run / REWARD_FOLDER)}
     return {"scorer": _scorer(run / SCORER_FILE, artifacts.hash_file(run / SCORER_FILE))}
+
+
+def _is_learned(dataset: DatasetRecord) -> bool:
+    return dataset.relabel is not None and dataset.relabel.learned is not None
 
 
 @functools.lru_cache(maxsize=2)
@@ -47,7 +51,7 @@ def check_online(run: Path, dataset: DatasetRecord, *, trust: bool = False) -> N
         BadInput: they cannot.
         ZestError: a file is missing or damaged.
     """
-    if dataset.relabel is not None and dataset.relabel.learned is not None:
+    if _is_learned(dataset):
         if LearnedReward.load(run / REWARD_FOLDER).inputs != "obs":
             raise BadInput(
                 f"the rewards of {run.name} were learned of embeddings, which are not made online; use --rtg constant "
