@@ -24,11 +24,12 @@ from zest_rl.metrics.statistics import MIN_EPISODES_TO_RANK
 from zest_rl.rewards.embeddings import EmbeddedEpisode
 from zest_rl.rewards.episode_goals import write_pictures
 from zest_rl.rewards.goals import GoalSpec
-from zest_rl.rewards.relabel import Reward, rewards_from_scores, view_cannot_tell
+from zest_rl.rewards.relabel import rewards_from_scores, view_cannot_tell
 from zest_rl.rewards.scorer import Scorer, ScorerConfig
 from zest_rl.rewards.scores import (
     Doubles,
     Features,
+    Reward,
     Similarity,
     alone,
     averaged,
