@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from hypothesis import settings
-from tiny_dataset import COLLECTED, SHORT_HORIZON
+from tiny_dataset import COLLECTED, SHORT_HORIZON, collect_some
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run in as many processes as there are cores
 settings.register_profile("zest", deadline=None, derandomize=True)  # a busy machine is no failure
@@ -40,27 +40,6 @@ def visual_tasks() -> Path:
     if not folder.is_dir():
         pytest.skip("no Visual Tasks Dataset: set ZEST_VISUAL_TASKS to its folder")
     return folder
-
-
-def collect_some(dataset_id: str, task: str, n_episodes: int) -> None:
-    """Leave a few noisy episodes of the expert in the Minari root."""
-    from zest_rl.data.writer import write_dataset
-    from zest_rl.kitchen.behaviour import Behaviour, recordings, rollout
-    from zest_rl.kitchen.env import env_spec
-    from zest_rl.runtime.arrays import concatenate
-
-    behaviour = Behaviour(task, "expert", noise_max=1.0)
-    episodes = concatenate([rollout(behaviour, index) for index in range(n_episodes)])
-    write_dataset(
-        dataset_id,
-        recordings(episodes),
-        env_spec=env_spec(task).to_json(),
-        ref_min_score=0.0,
-        ref_max_score=70.0,
-        algorithm_name="scripted expert with uniform action noise",
-        description="a few episodes for tests",
-        zest={"collect": {"asked": {"task": task}}},
-    )
 
 
 @pytest.fixture(scope="session")

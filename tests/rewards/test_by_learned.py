@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import collect_some
 from read_dataset import read
-from tiny_dataset import COLLECTED, SHORT_HORIZON
+from tiny_dataset import COLLECTED, SHORT_HORIZON, collect_some
 
 import zest_rl
 from zest_rl.data.reader import Dataset, dataset_path
