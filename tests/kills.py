@@ -171,8 +171,7 @@ def training(agent: str, n_processes: int = 1) -> Scenario:
 
 def small_dataset(folder: Path) -> str:
     """Leave the tiny dataset in a Minari root of its own."""
-    from conftest import collect_some
-    from tiny_dataset import COLLECTED
+    from tiny_dataset import COLLECTED, collect_some
 
     os.environ["MINARI_DATASETS_PATH"] = str(folder / "minari")
     collect_some(COLLECTED, "micro", 2)

@@ -34,7 +34,9 @@ CONFIGS: dict[str, Any] = {
     "bc": BCConfig(hidden_size=16, n_layers=2, batch_size=16, warmup_updates=5, learning_rate=1e-3),
     "dt": DTConfig(context_len=4, hidden_size=16, n_layers=1, batch_size=8, warmup_updates=5, learning_rate=1e-3),
     "rvs": RvSConfig(hidden_size=16, n_layers=2, batch_size=16, warmup_updates=5, dropout=0.1, n_networks=2),
-    "trex": TREXConfig(hidden_size=16, n_layers=1, batch_size=8, warmup_updates=5, dropout=0.1, n_networks=2),
+    "trex": TREXConfig(
+        hidden_size=16, n_layers=1, batch_size=8, warmup_updates=5, learning_rate=1e-3, dropout=0.1, n_networks=2
+    ),
 }
 
 
