@@ -15,14 +15,14 @@ from zest_rl.runtime import artifacts
 from zest_rl.runtime.hub import REWARD_FOLDER
 
 
-class OnlineReward(TypedDict, total=False):
+class RolloutReward(TypedDict, total=False):
     """One of the two, as `zest_rl.evaluation.rollout.run_episodes` takes it."""
 
     scorer: StateScorer
     reward: LearnedReward
 
 
-def load_online(run: Path, dataset: DatasetRecord) -> OnlineReward:
+def load_online(run: Path, dataset: DatasetRecord) -> RolloutReward:
     """Load what the run holds, which `check_online` accepted."""
     if _is_learned(dataset):
         return {"reward": LearnedReward.load(run / REWARD_FOLDER)}
