@@ -29,7 +29,8 @@ import zest_rl
 ROOT = Path(__file__).resolve().parents[1]
 BESIDE = (
     "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "datasets/README.md", "train/README.md", "eval/README.md",
-    "eval/*.toml", "eval/results/*.json", "benchmarks/README.md", "benchmarks/gpu.json", "benchmarks/metaworld/README.md",
+    "eval/*.toml", "eval/results/*.json", "benchmarks/README.md", "benchmarks/gpu.json",
+    "benchmarks/metaworld/README.md",
 )  # fmt: skip
 """What the site takes from outside of ``docs/``."""
 FENCED = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)
