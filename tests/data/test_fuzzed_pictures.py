@@ -10,7 +10,7 @@ import h5py
 import imageio.v2 as imageio
 import numpy as np
 import pytest
-from fuzzing import damaged_bytes, faults, outcome
+from fuzzing import damaged_bytes, faults, outcomes
 from PIL import Image, features
 
 from zest_rl.data.images import decode_image
@@ -36,8 +36,8 @@ def encoded(kind: str) -> bytes:
 @pytest.mark.parametrize("kind", FORMATS)
 def test_damaged_pictures_are_read_or_refused(kind: str, n: int) -> None:
     whole, rng = encoded(kind), random.Random(kind)
-    damaged = (damaged_bytes(whole, rng) for _ in range(n))
-    counts, wrong = faults(outcome(lambda data=data: hash_arrays(decode_image(data, "it"))) for data in damaged)
+    damaged = [damaged_bytes(whole, rng) for _ in range(n)]
+    counts, wrong = faults(outcomes(lambda i: hash_arrays(decode_image(damaged[i], "it")), n))
     print(f"{kind}: {n} inputs, {dict(counts)}")
     assert not wrong, wrong[0]
     assert counts["refused"]
@@ -54,8 +54,8 @@ def test_damaged_jpeg_files_among_observations_are_read_or_refused(n: int) -> No
                 entry[i] = np.frombuffer(row, np.uint8)
             return hash_arrays(*read_pictures(entry, slice(None)))
 
-    damaged = (damaged_bytes(whole, rng) for _ in range(n))
-    counts, wrong = faults(outcome(lambda data=data: read(data)) for data in damaged)
+    damaged = [damaged_bytes(whole, rng) for _ in range(n)]
+    counts, wrong = faults(outcomes(lambda i: read(damaged[i]), n))
     print(f"JPEG among observations: {n} inputs, {dict(counts)}")
     assert not wrong, wrong[0]
     assert counts["refused"]
@@ -73,7 +73,7 @@ def test_damaged_videos_are_read_or_refused(suffix: str, n: int, tmp_path: Path)
         path.write_bytes(data)
         return hash_arrays(frame_times(path), *iter_frames(path, 0.15, 3))
 
-    damaged = (damaged_bytes(whole, rng) for _ in range(n))
-    counts, wrong = faults(outcome(lambda data=data: read(data)) for data in damaged)
+    damaged = [damaged_bytes(whole, rng) for _ in range(n)]
+    counts, wrong = faults(outcomes(lambda i: read(damaged[i]), n))
     print(f"{suffix}: {n} inputs, {dict(counts)}")
     assert not wrong, wrong[0]

@@ -4,14 +4,13 @@ import random
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from fuzzing import damaged_bytes, faults, outcome
+from fuzzing import damaged_bytes, faults, outcomes
 from PIL import Image
 
 from zest_rl.errors import ZestError
@@ -122,11 +121,11 @@ def test_whatever_happens_to_the_files_the_embeddings_are_those_of_the_frames(
         for path in files:
             path.write_bytes(damaged_bytes(whole[path], rng) if rng.random() < 0.5 else whole[path])
 
-    outcomes = [outcome(partial(read, seed)) for seed in range(n_inputs)]
-    kinds, wrong = faults(outcomes)
+    ends = outcomes(read, n_inputs)
+    kinds, wrong = faults(ends)
     assert not wrong
     assert kinds == {"read": n_inputs}
-    assert {one.detail for one in outcomes} == {repr(artifacts.hash_arrays(*expected))}
+    assert {end.detail for end in ends} == {repr(artifacts.hash_arrays(*expected))}
 
 
 def test_whole_files_with_other_numbers_are_refused_and_nothing_is_deleted(source: Source, tmp_path: Path) -> None:

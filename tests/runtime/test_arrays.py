@@ -2,13 +2,12 @@ from __future__ import annotations
 
 import multiprocessing
 import random
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from fuzzing import damaged_bytes, faults, outcome
+from fuzzing import damaged_bytes, faults, outcomes
 
 from zest_rl.errors import ZestError
 from zest_rl.runtime import artifacts
@@ -73,13 +72,14 @@ def test_damaged_files_are_missing_files(n_inputs: int, tmp_path: Path) -> None:
         got = read_arrays(path)
         return None if got is None else artifacts.hash_arrays(*(got[name] for name in sorted(got)))
 
-    outcomes = [outcome(partial(read, damaged_bytes(whole, rng))) for _ in range(n_inputs)]
-    kinds, wrong = faults(outcomes)
+    damaged = [damaged_bytes(whole, rng) for _ in range(n_inputs)]
+    ends = outcomes(lambda i: read(damaged[i]), n_inputs)
+    kinds, wrong = faults(ends)
     assert not wrong
     assert kinds == {"read": n_inputs}
     as_written = artifacts.hash_arrays(*(arrays[name] for name in sorted(arrays)))
-    assert {one.detail for one in outcomes} <= {"None", repr(as_written)}
-    assert sum(one.detail == "None" for one in outcomes) > n_inputs / 2
+    assert {end.detail for end in ends} <= {"None", repr(as_written)}
+    assert sum(end.detail == "None" for end in ends) > n_inputs / 2
 
 
 def test_files_without_digests_are_damage_unless_they_belong_to_runs(tmp_path: Path) -> None:

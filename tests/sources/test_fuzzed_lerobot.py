@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from fuzzing import damaged_bytes, damaged_json, faults, outcome
+from fuzzing import damaged_bytes, damaged_json, faults, outcomes
 from lerobot_files import store_pictures, write_lerobot
 from rollouts import Episode
 
@@ -52,8 +52,8 @@ def test_damaged_lerobot_folders_are_read_or_refused(what: str, n: int, root: Pa
             return json.dumps(damaged_json(json.loads(whole), rng)).encode()
         return damaged_bytes(whole, rng)
 
-    inputs = (damaged() for _ in range(n))
-    counts, wrong = faults(outcome(lambda data=data: read(data)) for data in inputs)
+    inputs = [damaged() for _ in range(n)]
+    counts, wrong = faults(outcomes(lambda i: read(inputs[i]), n))
     path.write_bytes(whole)
     print(f"LeRobot {what}: {n} inputs, {dict(counts)}")
     assert not wrong, wrong[0]
