@@ -10,6 +10,7 @@ from typing import Any
 import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
 import gymnasium
 import gymnasium_robotics  # noqa: F401  # registers its environments
+import numpy as np
 import pytest
 from tiny_comparison import refuse_edited, write
 
@@ -85,6 +86,7 @@ def test_given_datasets_that_cannot_be_used_are_refused_before_anything_runs(
 
 PUSH = """
 title = "Given"
+seeds = [0, 1]
 
 [tasks.push]
 dataset = "given/push-v0"
@@ -98,26 +100,46 @@ views = 1
 goal = "episode:0"
 
 [train]
-n_updates = 20
-warmup_updates = 0
 hidden_size = 16
 n_layers = 1
+
+[train.bc]
+n_updates = 20
+warmup_updates = 0
+
+[train.rvs]
+n_updates = 20
+warmup_updates = 0
+
+[train.ppo]
+n_steps = 32
+n_envs = 2
+rollout = 16
+batch_size = 16
+start_updates = 5
+log_every = 16
 
 [evaluate]
 n_episodes = 2
 videos = false
 
 [methods.BC]
+seeds = [0]
 agent = "bc"
 goal = "episode"
 
 [methods."ZeST+RvS"]
+seeds = [0]
 agent = "rvs"
 goal = "episode"
 
 [methods."GT-reward RvS"]
+seeds = [0]
 agent = "rvs"
 kind = "control"
+
+[methods.PPO]
+agent = "ppo"
 """
 
 
@@ -149,6 +171,7 @@ def test_methods_are_compared_on_a_dataset_of_another_robot(
         "BC": ("method", 2),
         "ZeST+RvS": ("method", 2),
         "GT-reward RvS": ("control", 2),
+        "PPO": ("method", 4),
     }
     assert result["rows"]["Demo"]["normalized_return"] == pytest.approx(60), "-4 of -10 to 0"
     assert result["rows"]["BC"]["normalized_return"] == pytest.approx(60), "4 steps, as the recipe says, and not 50"
@@ -156,5 +179,16 @@ def test_methods_are_compared_on_a_dataset_of_another_robot(
     assert result["tasks"]["push"]["dataset"] == {"dataset": "given/push-v0"}
     assert list(result["seconds_by_stage"]) == ["relabel", "train and evaluate", "report"], "nothing is collected"
     html = (tmp_path / "out" / "report.html").read_text()
-    assert all(part in html for part in ("ZeST+RvS", "given/push-v0", "episode:0"))
+    assert all(part in html for part in ("ZeST+RvS", "given/push-v0", "episode:0", "Step in the environment"))
+    of_task = result["tasks"]["push"]
+    assert {name: len(of_seeds) for name, of_seeds in of_task["train_seconds"].items()} == {
+        "BC": 1, "ZeST+RvS": 1, "GT-reward RvS": 1, "PPO": 2,
+    }  # fmt: skip
+    curves = of_task["learning_curves"]
+    assert {name: (curve["quantity"], curve["steps"]) for name, curve in curves.items()} == {
+        "PPO": ("normalized return, %", [16, 32])
+    }
+    low, mean, high = (np.array(curves["PPO"][key]) for key in ("low", "mean", "high"))
+    np.testing.assert_allclose(mean, (low + high) / 2, atol=0.01)
+    assert ((low >= 60) & (high <= 100)).all()
     assert zest(*words)["n_cells_run"] == 0

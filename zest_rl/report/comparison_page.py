@@ -29,6 +29,7 @@ from zest_rl.report.sections import (
     EPISODES,
     GOALS,
     LEARNING_CURVES,
+    ONLINE_CURVES,
     RANKING,
     RESULTS,
     TASK_TABLES,
@@ -138,35 +139,42 @@ def return_curve(method: Method) -> Series | None:
 
 
 def learning_curve(method: Method) -> Series | None:
-    """Return the training loss, or the returns while a policy learned in its environment, over what the log counts.
+    """Return the training loss over gradient steps; None for what learned in the environment, or as in `_log`."""
+    log = _log(method, "loss")
+    return log and _curve(method.name, "training loss (mean squared error of actions)", *log)
 
-    None if logged less than twice; of several seeds also the range.
+
+def online_curve(method: Method) -> Series | None:
+    """Return the returns while a policy learned in its environment over its steps; None for others, or as in `_log`."""
+    log = _log(method, "return")
+    if log is None:
+        return None
+    quantity, (steps, columns), dataset = "return", log, DatasetRecord.of_run(read_meta(method.runs[0]))
+    if dataset.ref_min_score is not None and dataset.ref_max_score is not None:
+        quantity = "normalized return, %"
+        columns = [[*normalized_return(np.array(c), dataset.ref_min_score, dataset.ref_max_score)] for c in columns]
+    return _curve(method.name, quantity, steps, columns)
+
+
+def _log(method: Method, column: str) -> tuple[list[float], list[list[float]]] | None:
+    """Read what is counted, and one column of the log for each seed, cut to the shortest.
+
+    None without a log, as a snapshot, or such a column, or if logged less than twice.
     """
-    quantity, columns = "training loss (mean squared error of actions)", []
-    if not all((run / "metrics.csv").exists() for run in method.runs):
-        return None  # a snapshot has no log
-    for run in method.runs:
-        path = run / "metrics.csv"
+    logs = []
+    for path in (run / "metrics.csv" for run in method.runs):
+        if not path.exists():
+            return None
         check_file(path)
         with reading_record(path), path.open(newline="", encoding="utf-8") as file:
             names, *rows = csv.reader(file)
-            learns_online = "return" in names
-            value = names.index("return" if learns_online else "loss")
-            columns.append([(float(row[0]), float(row[value])) for row in rows])
-    length = min(map(len, columns))
+            if column not in names:
+                return None
+            logs.append([(float(row[0]), float(row[names.index(column)])) for row in rows])
+    length = min(map(len, logs))
     if length < 2:
         return None
-    steps = [step for step, _ in columns[0][:length]]
-    values = [[value for _, value in column[:length]] for column in columns]
-    if learns_online:
-        quantity, dataset = "return of the newest episodes in training", DatasetRecord.of_run(read_meta(method.runs[0]))
-        if dataset.ref_min_score is not None and dataset.ref_max_score is not None:
-            quantity = f"normalized {quantity}, %"
-            values = [
-                [*normalized_return(np.array(of_run), dataset.ref_min_score, dataset.ref_max_score)]
-                for of_run in values
-            ]
-    return _curve(method.name, quantity, steps, values)
+    return [step for step, _ in logs[0][:length]], [[value for _, value in log[:length]] for log in logs]
 
 
 def _curve(name: str, quantity: str, steps: Sequence[float], columns: Sequence[Sequence[float]]) -> Series:
@@ -278,6 +286,7 @@ def compare(
         for name in (name for name, agent in agents.items() if agent != "bc"):
             episodes += paired_episodes(first[cloned], first[name], film)
     curves = (draw(method) for draw in (return_curve, learning_curve) for method in methods)
+    online = map(online_curve, methods)
     return Report(
         title,
         headline(
@@ -291,6 +300,7 @@ def compare(
             GOALS(goal_panels),
             RANKING(scatters),
             EPISODES(episodes),
+            ONLINE_CURVES(curve for curve in online if curve is not None),
             LEARNING_CURVES(curve for curve in curves if curve is not None),
             DETAILS([*(details or {}).items(), *((f"run {Path(run).name}", meta) for run, meta in metas.items())]),
         ),
@@ -326,7 +336,6 @@ def overview(
     rows.insert(0, dataset_row(*sources, paper=paper_demo))
     metas = {method.name: read_meta(method.runs[0]) for method in next(iter(methods.values()))}
     scatters = [(task, scatter) for task, report in reports.items() for scatter in report.items(RANKING)]
-    curves = [(task, curve) for task, report in reports.items() for curve in report.items(LEARNING_CURVES)]
     return Report(
         title,
         headline(rows, metas, lambda before, after: gain(evaluations[before], evaluations[after]), len(reports)),
@@ -335,7 +344,14 @@ def overview(
             TASK_TABLES(TaskTable(task, report.items(RESULTS), pages[task]) for task, report in reports.items()),
             CAVEATS(caveats),
             RANKING(replace(scatter, name=f"{task}: {scatter.name}") for task, scatter in scatters),
-            LEARNING_CURVES(replace(curve, quantity=f"{task}: {curve.quantity}") for task, curve in curves),
+            *(
+                kind(
+                    replace(curve, quantity=f"{task}: {curve.quantity}")
+                    for task, report in reports.items()
+                    for curve in report.items(kind)
+                )
+                for kind in (ONLINE_CURVES, LEARNING_CURVES)
+            ),
             DETAILS((details or {}).items()),
         ),
     )

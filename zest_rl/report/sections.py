@@ -149,5 +149,12 @@ LEARNING_CURVES = SectionKind[Series](
     "Lines are means over seeds; a band, where there is one, is their spread.",
     x_name="Gradient step",
 )
+ONLINE_CURVES = SectionKind[Series](
+    "Learning in the environment",
+    "curves.html",
+    "Mean return of the newest 20 episodes of the training, which also explores. Lines are means over seeds; a band, "
+    "where there is one, is their spread.",
+    x_name="Step in the environment",
+)
 DETAILS = SectionKind[tuple[str, object]]("Details", "details.html", "Everything needed to make these figures again.")
 """Configs, versions, provenance: a name and anything that reads as JSON; each is a collapsed block."""

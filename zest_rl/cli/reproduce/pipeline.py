@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from zest_rl.report.methods import Method
     from zest_rl.report.sections import Report
     from zest_rl.simulation.videos import Video
+    from zest_rl.types import FloatArray
 
 
 def run_comparison(
@@ -61,6 +62,7 @@ def run_comparison(
         videos: list[Video] = []
         details = {"recipe": {"file": recipe, **asdict(comparison.tables)}, "code": made_by}
         task_pages, page = _pages(comparison, cells, datasets, details, about_code, videos)
+        seconds = {cell.name: seconds_of(cell, output) for cell in cells}
         result = {
             "summary": page.summary,
             "rows": _rows(page),
@@ -68,12 +70,14 @@ def run_comparison(
                 task: {
                     "rows": _rows(task_page),
                     "spearman_of_zest_and_true_returns": _rank_correlations(task_page),
+                    "train_seconds": _train_seconds(task, cells, seconds),
+                    "learning_curves": _learning_curves(task_page),
                     "dataset": datasets[task].collect_result,
                 }
                 for task, task_page in task_pages.items()
             },
             "seeds": list(comparison.tables.seeds),
-            "seconds_by_cell": {cell.name: seconds_of(cell, output) for cell in cells},
+            "seconds_by_cell": seconds,
             "code": made_by,
             "provenance": artifacts.provenance(),
         }
@@ -198,3 +202,31 @@ def _rank_correlations(page: Report) -> dict[str, Any]:
         scatter.name: None if math.isnan(scatter.spearman) else {"value": scatter.spearman, "ci95": scatter.ci}
         for scatter in page.items(RANKING)
     }
+
+
+def _train_seconds(task: str, cells: Sequence[Cell], seconds: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    """Return how long each seed of each method was trained on a task, where that is known."""
+    found: dict[str, list[float]] = {}
+    for cell in cells:
+        if cell.task == task and "train_seconds" in seconds[cell.name]:
+            found.setdefault(cell.method, []).append(seconds[cell.name]["train_seconds"])
+    return found
+
+
+def _learning_curves(page: Report) -> dict[str, Any]:
+    """Return the returns while policies learned in the environment, by method: mean over seeds, and range."""
+    from zest_rl.report.sections import ONLINE_CURVES
+
+    return {
+        curve.name: {
+            "quantity": curve.quantity,
+            "steps": [int(step) for step in curve.steps],
+            "mean": _rounded(curve.values),
+            **({} if curve.band is None else {"low": _rounded(curve.band[0]), "high": _rounded(curve.band[1])}),
+        }
+        for curve in page.items(ONLINE_CURVES)
+    }
+
+
+def _rounded(values: FloatArray) -> list[float]:
+    return [round(float(value), 2) for value in values]
