@@ -37,8 +37,9 @@ lint: setup ## ruff and mypy
 bench: setup ## compare speeds with other implementations
 	.venv/bin/python -m benchmarks
 
-tables: setup ## write the tables of README.md, docs/results.md and eval/README.md from eval/results
+tables: setup ## write the tables of README.md, docs/results.md and eval/README.md, and their figures, from eval/results
 	.venv/bin/python docs/tables.py
+	.venv/bin/python docs/figures.py
 
 hero: setup ## make the README's pictures; the moving one is from runs/demo, the output of make demo
 	.venv/bin/python docs/task_sheet.py

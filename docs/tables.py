@@ -3,7 +3,8 @@
 What stands between two comments is written again::
 
     <!-- make tables: table1, rows BC | ZeST+DT -->     these rows of eval/results/table1.json, over all tasks alone
-    <!-- make tables: table1 -->                        all rows, each task, how well scores rank the episodes, the time
+    <!-- make tables: table1 -->                        all rows, each task, how scores rank the episodes, the time,
+                                                        and the learning curves of what learned in an environment
     <!-- make tables: recipes -->                       every recipe of eval/: its results, or what it needs
     <!-- end -->
 """
@@ -39,7 +40,8 @@ def _table(name: str, rows: str | None) -> str:
         shown = rows.split(" | ")
         return f"{as_markdown(result, shown)}\n{_source(result, shown)}.\n"
     return (
-        f"{as_markdown(result)}\n{_ranks(result)}\n{_source(result, result['rows'])}; wall time: {wall_time(result)}.\n"
+        f"{as_markdown(result)}\n{_ranks(result)}\n{_curves(name, result)}"
+        f"{_source(result, result['rows'])}; wall time: {wall_time(result)}.\n"
     )
 
 
@@ -52,6 +54,18 @@ def _ranks(result: Mapping[str, Any]) -> str:
         cells = ("–" if rank is None else f"{rank['value']:.2f}" for rank in found)
         lines.append(f"| {goal} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def _curves(name: str, result: Mapping[str, Any]) -> str:
+    """Show the picture of the learning curves, if there are any, and say how long these trainings took."""
+    tasks = result["tasks"].values()
+    names = {method for task in tasks for method in task.get("learning_curves", ())}
+    if not names:
+        return ""
+    times = {method: [s for task in tasks for s in task["train_seconds"][method]] for method in sorted(names)}
+    mean = ", ".join(f"{method} {sum(of_all) / len(of_all) / 60:.1f} min" for method, of_all in times.items())
+    alt = "Returns of the newest 20 episodes in training; lines are means over seeds, bands their range"
+    return f"![{alt}](images/{name}.svg)\n\nOne training took, in the mean over tasks and seeds: {mean}.\n\n"
 
 
 def _source(result: Mapping[str, Any], shown: Iterable[str]) -> str:

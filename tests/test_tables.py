@@ -1,4 +1,4 @@
-"""The tables of README.md, docs/results.md and eval/README.md say what the committed results say."""
+"""The tables of README.md, docs/results.md and eval/README.md, and figures of the site, say what the results say."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLES = runpy.run_path(str(ROOT / "docs" / "tables.py"))
+FIGURES = runpy.run_path(str(ROOT / "docs" / "figures.py"))
 RESULTS = {
     path.stem: json.loads(path.read_text(encoding="utf-8"))
     for path in sorted((ROOT / "eval" / "results").glob("*.json"))
@@ -39,6 +40,37 @@ def test_every_table_of_the_results_page_is_made_and_every_comparison_has_one() 
     text = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
     assert "\n|" not in TABLES["BLOCK"].sub("", text)
     assert {block[2] for block in TABLES["BLOCK"].finditer(text)} == set(COMPARISONS)
+
+
+@pytest.mark.parametrize("name", sorted(FIGURES["FIGURES"].keys() & RESULTS.keys()))
+def test_a_figure_is_drawn_from_committed_results(name: str) -> None:
+    picture = (ROOT / "docs" / "images" / f"{name}.svg").read_text(encoding="utf-8")
+    assert picture == FIGURES["drawn"](name), "run `make tables`"
+    assert len(picture) < 200_000
+
+
+def test_learning_curves_are_drawn_over_the_levels_of_the_other_methods_and_their_time_is_told() -> None:
+    curve = {
+        "quantity": "return",
+        "steps": [1000, 2000],
+        "mean": [60.0, 70.0],
+        "low": [50.0, 65.0],
+        "high": [70.0, 75.0],
+    }
+    task = {
+        "rows": {name: {"kind": "method", "normalized_return": 50.0} for name in ("BC", "TRPO")},
+        "learning_curves": {"TRPO": curve},
+        "train_seconds": {"BC": [1.0], "TRPO": [60.0, 120.0]},
+    }
+    result = {"tasks": {"micro": task, "sdoor": task}}
+    panels = FIGURES["learning_curves"](result).axes
+    assert [axes.get_title() for axes in panels] == ["micro", "sdoor"]
+    assert [[*line.get_ydata()] for line in panels[1].lines] == [[50, 50], [60, 70]]
+    assert len(panels[1].collections) == 1, "the range of the seeds"
+    text = TABLES["_curves"]("rl", result)
+    assert "(images/rl.svg)" in text
+    assert "TRPO 1.5 min" in text
+    assert TABLES["_curves"]("table1", {"tasks": {"micro": {"rows": {}}}}) == ""
 
 
 @pytest.mark.parametrize("name", RESULTS)

@@ -114,6 +114,7 @@ def run_reward_study(study: RewardStudy, output: Path, ui: Ui, *, n_workers: int
             }
             for (ranking, inputs), cells in judged.items()
         ],
+        "returns": _returns(judged),
         "paper": study.tables.paper,
         "train": study.train,
         "relabel": {name: {**study.tables.relabel, **table} for name, table in study.tables.rankings.items()},
@@ -130,6 +131,27 @@ def figures(judgement: Judgement) -> dict[str, float | None]:
     names = ("accuracy", "plain", "rho_seen", "rho_unseen")
     values = {name: getattr(judgement, name) for name in names}
     return {name: None if math.isnan(value) else round(value, 4) for name, value in values.items()}
+
+
+def _returns(judged: Mapping[tuple[str, str], Mapping[str, Judgement]]) -> dict[str, Any]:
+    """Return what a figure shows of the reward that is best over tasks: each trajectory's learned and true return."""
+    import numpy as np
+
+    (ranking, inputs), cells = max(
+        judged.items(), key=lambda row: np.nansum([judgement.accuracy for judgement in row[1].values()])
+    )
+    return {
+        "ranking": ranking,
+        "inputs": inputs,
+        "tasks": {
+            task: {
+                "true": judgement.true_returns.round(2).tolist(),
+                "learned": judgement.learned_returns.round(2).tolist(),
+                "held_out": judgement.held_out.nonzero()[0].tolist(),
+            }
+            for task, judgement in cells.items()
+        },
+    }
 
 
 def lines(result: Mapping[str, Any]) -> list[tuple[str, list[float | None]]]:
