@@ -13,8 +13,9 @@ from PIL import Image
 from read_dataset import read
 from rollouts import Episode, Run, expected_scores, write_blind
 
-from zest_rl.data.reader import Dataset
-from zest_rl.errors import BadInput
+from zest_rl.data.reader import Dataset, open_dataset
+from zest_rl.errors import BadInput, ZestError
+from zest_rl.sources.recorded_frames import middle_view
 from zest_rl.sources.videos import find_videos
 from zest_rl.types import Frame
 
@@ -22,6 +23,16 @@ from zest_rl.types import Frame
 def write_video(path: Path, frames: list[Frame]) -> None:
     """H.264 as people have it."""
     imageio.mimwrite(path, frames, fps=10, codec="libx264", quality=9, macro_block_size=2)
+
+
+def write_films_and_masks(folder: Path, episodes: list[Episode]) -> None:
+    """``films`` as pictures, and ``masks`` that hide nothing."""
+    for i, episode in enumerate(episodes):
+        for name in ("films", "masks"):
+            (folder / name / f"episode_{i}").mkdir(parents=True)
+        for t, frame in enumerate(episode.frames):
+            Image.fromarray(frame).save(folder / "films" / f"episode_{i}" / f"{t}.png")
+            Image.new("L", frame.shape[1::-1]).save(folder / "masks" / f"episode_{i}" / f"{t}.png")
 
 
 def test_folders_of_videos_and_of_pictures_are_views(
@@ -49,12 +60,7 @@ def test_folders_of_videos_and_of_pictures_are_views(
 def test_inspect_shows_what_lies_in_a_folder_as_long_as_it_is_what_was_scored(
     maze: list[Episode], goal: Path, zest: Run, tmp_path: Path, *, masks: bool
 ) -> None:
-    for i, episode in enumerate(maze):
-        for name in ("films", "masks"):
-            (tmp_path / name / f"episode_{i}").mkdir(parents=True)
-        for t, frame in enumerate(episode.frames):
-            Image.fromarray(frame).save(tmp_path / "films" / f"episode_{i}" / f"{t}.png")
-            Image.new("L", frame.shape[1::-1]).save(tmp_path / "masks" / f"episode_{i}" / f"{t}.png")
+    write_films_and_masks(tmp_path, maze)
     words = ["--frames", tmp_path / "films", *(["--masks", tmp_path / "masks"] if masks else [])]
     made = zest("relabel", write_blind(maze), "--goal", goal, *words, "--n-workers", "1")["dataset"]
 
@@ -77,6 +83,25 @@ def test_inspect_shows_what_lies_in_a_folder_as_long_as_it_is_what_was_scored(
         assert "<h2>Not shown</h2>" in without
         assert 'class="strip"' not in without
         assert str(tmp_path) not in without
+
+
+def test_a_curated_dataset_finds_the_films_of_its_episodes_among_those_of_all(
+    maze: list[Episode], goal: Path, zest: Run, tmp_path: Path
+) -> None:
+    write_films_and_masks(tmp_path, maze)
+    words = ["--goal", goal, "--frames", tmp_path / "films", "--masks", tmp_path / "masks", "--n-workers", "1"]
+    scored = zest("relabel", write_blind(maze), *words)["dataset"]
+    curated = zest("curate", scored, "--keep", "0.67", "--output", tmp_path / "table.csv")["dataset"]
+    for made in (curated, zest("relabel", curated, *words)["dataset"]):
+        with open_dataset(made) as ds:
+            assert ds.record.curate is not None
+            films = middle_view(ds)
+            for i, number in enumerate(ds.record.curate.episodes):
+                np.testing.assert_array_equal([frame for (frame,) in films.read(i)], maze[number].frames)
+        assert len(read(made, Dataset.scores)) == 2
+    shutil.rmtree(tmp_path / "films" / "episode_1")
+    with open_dataset(curated) as ds, pytest.raises(ZestError, match="not those that were scored"):
+        middle_view(ds)
 
 
 def test_one_frame_may_be_missing_at_the_end_and_no_more(

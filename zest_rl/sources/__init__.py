@@ -126,15 +126,17 @@ def open_source(
             scene = SceneConfig(tuple(robot), look_at, show_robot, n_views, tolerance)
             episode_frames = None if folders else _minari_frames(ds, keys, cameras, env, scene)
             trajectories = DatasetCopy.of(ds)
+        numbers = None if ds is None or ds.record.curate is None else ds.record.curate.episodes
+    n_episodes = len(trajectories.n_steps)
     if folders:
-        episode_frames = find_videos(folders, len(trajectories.n_steps), dataset)
+        episode_frames = find_videos(folders, n_episodes, dataset, numbers)
     if episode_frames is None:
         raise BadInput(f"{dataset} shows no frames; give --frames FOLDER with a video of each episode")
     if masks:
         if episode_frames.describe()["kind"] == "scene":
             raise BadInput("--masks is for frames that show a robot (--frames, --camera), hidden here; leave it out")
-        n_episodes = len(trajectories.n_steps)
-        episode_frames = without_masked(episode_frames, [user_path(name) for name in masks], n_episodes, dataset)
+        mask_folders = [user_path(name) for name in masks]
+        episode_frames = without_masked(episode_frames, mask_folders, n_episodes, dataset, numbers)
     return Source(trajectories, episode_frames)
 
 

@@ -68,7 +68,9 @@ class MaskedFrames:
             raise BadInput(f"episode {episode} must have one mask for each frame, and has more of one") from error
 
 
-def without_masked(frames: EpisodeFrames, folders: Sequence[Path], n_episodes: int, what: str) -> MaskedFrames:
+def without_masked(
+    frames: EpisodeFrames, folders: Sequence[Path], n_episodes: int, what: str, numbers: Sequence[int] | None = None
+) -> MaskedFrames:
     """Fill frames where masks are white.
 
     Args:
@@ -76,6 +78,7 @@ def without_masked(frames: EpisodeFrames, folders: Sequence[Path], n_episodes: i
         folders: of masks, one per view: ``episode_0.mp4``, or ``episode_0/`` with pictures.
         n_episodes: of the dataset.
         what: names the dataset in an error.
+        numbers: as in `find_videos`.
 
     Raises:
         BadInput: there are more or fewer folders than views, or as `find_videos`.
@@ -90,4 +93,4 @@ def without_masked(frames: EpisodeFrames, folders: Sequence[Path], n_episodes: i
             raise BadInput(
                 f"--masks {folder} is not a folder; give one that holds episode_0.mp4, or episode_0/ of PNGs"
             )
-    return MaskedFrames(frames, find_videos(folders, n_episodes, what))
+    return MaskedFrames(frames, find_videos(folders, n_episodes, what, numbers))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,11 @@ from zest_rl.simulation.framing import ObjectRing
 from zest_rl.simulation.makers import check_named
 from zest_rl.simulation.scene import SceneConfig
 from zest_rl.sources.base import EpisodeFrames
-from zest_rl.sources.masked import MaskedFrames, without_masked
+from zest_rl.sources.masked import without_masked
 from zest_rl.sources.pictures import Pictures, picture_entries
 from zest_rl.sources.scenes import find_scene
 from zest_rl.sources.states import DEFAULT_CAMERA, check_env, find_states
-from zest_rl.sources.videos import find_videos
+from zest_rl.sources.videos import find_videos, videos_of
 
 
 def middle_view(ds: Dataset) -> EpisodeFrames:
@@ -61,17 +61,23 @@ def _in_folders(ds: Dataset, facts: Mapping[str, Any]) -> EpisodeFrames:
     assert ds.record.relabel is not None
     folders, masks = ([Path(path) for path in facts.get(name, ())] for name in ("folders", "mask_folders"))
     lay, what = f"its frames lay in {', '.join(folder.name for folder in folders + masks)}", f"dataset {ds.id}"
-    n_episodes, middle = len(ds.groups), len(folders) // 2
+    numbers = None if ds.record.curate is None else ds.record.curate.episodes
     if not all(folder.is_dir() for folder in folders + masks):
         raise ZestError(f"{lay}, which is not there")
     changed = ZestError(f"{lay}, and the files there are not those that were scored")
+
+    def find(views: slice, n_episodes: int, numbers: Sequence[int] | None) -> EpisodeFrames:
+        clips = find_videos(folders[views], n_episodes, what, numbers)
+        return without_masked(clips, masks[views], n_episodes, what, numbers) if masks else clips
+
     try:
-        clips = find_videos(folders, n_episodes, what)
-        scored = without_masked(clips, masks, n_episodes, what) if masks else clips
-        digests = [scored.digest(episode) for episode in range(n_episodes)]
-    except BadInput as error:
+        n_found = len(ds.groups) if numbers is None else len(videos_of(folders[0]))
+        everything = find(slice(None), n_found, None)
+        digests = [everything.digest(episode) for episode in range(n_found)]
+        of_these = [digests[number] for number in numbers or ()]  # what was scored if it was after they were chosen
+        if ds.record.relabel.frames_sha256 not in [artifacts.hash_json(digests), artifacts.hash_json(of_these)]:
+            raise changed
+        middle = len(folders) // 2
+        return find(slice(middle, middle + 1), len(ds.groups), numbers)
+    except (BadInput, IndexError) as error:
         raise changed from error
-    if artifacts.hash_json(digests) != ds.record.relabel.frames_sha256:
-        raise changed
-    seen = clips.view(middle)
-    return MaskedFrames(seen, scored.masks.view(middle)) if isinstance(scored, MaskedFrames) else seen

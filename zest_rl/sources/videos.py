@@ -61,35 +61,48 @@ def _files(path: Path) -> list[Path]:
     return frame_files(path) if path.is_dir() else [path]
 
 
-def find_videos(folders: Sequence[Path], n_episodes: int, what: str) -> EpisodeVideos:
+def find_videos(
+    folders: Sequence[Path], n_episodes: int, what: str, numbers: Sequence[int] | None = None
+) -> EpisodeVideos:
     """Find the video of every episode in each folder.
 
     Args:
         folders: one per view.
         n_episodes: of the dataset.
         what: names the dataset in an error.
+        numbers: of the episodes of a curated dataset in its source; the folders hold those that were dropped, too.
 
     Raises:
         BadInput: the video of an episode is missing or there are two, or there are more videos than episodes.
     """
     paths = []
     for folder in folders:
-        by_number: dict[int, Path] = {}
-        for path in sorted(folder.iterdir()):
-            name = _NAME.fullmatch(path.name if path.is_dir() else path.stem)
-            if name is None or not (path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES):
-                continue
-            if (number := int(name[1])) in by_number:
-                raise BadInput(f"{path} and {by_number[number].name} are both of episode {number}; remove one")
-            if not path.is_dir():
-                check_file(path)
-            by_number[number] = path
-        missing = [number for number in range(n_episodes) if number not in by_number]
-        if missing or len(by_number) > n_episodes:
+        by_number = videos_of(folder)
+        missing = [number for number in numbers or range(n_episodes) if number not in by_number]
+        if missing or (numbers is None and len(by_number) > n_episodes):
             raise BadInput(
                 f"{folder} must hold episode_0.mp4 (or a folder episode_0 of pictures) and so on, one for each of the "
                 f"{n_episodes} episodes of {what}; "
                 + (f"{len(missing)} are missing, the first is {missing[0]}" if missing else f"got {len(by_number)}")
             )
-        paths.append(tuple(by_number[number] for number in range(n_episodes)))
+        paths.append(tuple(by_number[number] for number in numbers or range(n_episodes)))
     return EpisodeVideos(tuple(paths))
+
+
+def videos_of(folder: Path) -> dict[int, Path]:
+    """Return the videos in a folder, or folders of pictures, by the number of the episode.
+
+    Raises:
+        BadInput: an episode has two.
+    """
+    by_number: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        name = _NAME.fullmatch(path.name if path.is_dir() else path.stem)
+        if name is None or not (path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES):
+            continue
+        if (number := int(name[1])) in by_number:
+            raise BadInput(f"{path} and {by_number[number].name} are both of episode {number}; remove one")
+        if not path.is_dir():
+            check_file(path)
+        by_number[number] = path
+    return by_number
