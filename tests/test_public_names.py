@@ -93,12 +93,14 @@ def test_an_unknown_name_is_no_attribute() -> None:
         zest_rl.rellabel  # noqa: B018
 
 
-@pytest.mark.parametrize("first", ["import zest_rl.export.transitions, zest_rl.report.html", ""])
-def test_export_and_report_are_rooms_and_functions_whatever_is_imported_first(first: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("first", ["import zest_rl.export.transitions, zest_rl.report.html, zest_rl.explore", ""])
+def test_rooms_with_the_name_of_a_verb_are_called_like_it_whatever_is_imported_first(
+    first: str, tmp_path: Path
+) -> None:
     code = f"""
 {first}
 import zest_rl
-for verb in (zest_rl.export, zest_rl.report):
+for verb in (zest_rl.export, zest_rl.report, zest_rl.explore):
     try:
         verb("x/nothing-v0")
     except zest_rl.errors.BadInput as error:
@@ -108,9 +110,10 @@ assert zest_rl.export.to_d3rlpy is to_d3rlpy
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    missing_dataset, missing_run = done.stdout.splitlines()
+    missing_dataset, missing_run, nothing_to_explore = done.stdout.splitlines()
     assert "x/nothing-v0" in missing_dataset
     assert "x/nothing-v0 is not the folder of a training" in missing_run
+    assert "x/nothing-v0" in nothing_to_explore
 
 
 @pytest.mark.parametrize(
@@ -129,7 +132,7 @@ def test_a_wrong_argument_is_named(call: Any, message: str) -> None:
         call()
 
 
-@pytest.mark.parametrize("verb", ["collect", "evaluate", "export", "inspect", "push", "relabel", "report"])
+@pytest.mark.parametrize("verb", ["collect", "evaluate", "explore", "export", "inspect", "push", "relabel", "report"])
 def test_the_functions_name_all_flags_of_their_verbs(verb: str) -> None:
     import importlib
     from dataclasses import fields

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         collect,
         curate,
         evaluate,
+        explore,
         export,
         inspect,
         load_policy,
@@ -31,15 +32,15 @@ if TYPE_CHECKING:
     from zest_rl.embedders import load_embedder
 
 __all__ = [
-    "Curve", "collect", "curate", "evaluate", "export", "inspect", "load_embedder", "load_policy", "open_dataset",
-    "push", "relabel", "report", "score", "train", "with_rewards",
+    "Curve", "collect", "curate", "evaluate", "explore", "export", "inspect", "load_embedder", "load_policy",
+    "open_dataset", "push", "relabel", "report", "score", "train", "with_rewards",
 ]  # fmt: skip
 __version__ = "0.1.0"
 __path__ = [*__path__, f"{__path__[0]}/kitchen/aliases"]  # modules that datasets on disk name by an earlier name
 
 _MODULES = {"Curve": "analysis.curves", "score": "analysis.curves", "load_embedder": "embedders"}
 """Modules of the public names that are not of `zest_rl.api`."""
-_ROOMS_AND_VERBS = ("export", "report")
+_ROOMS_AND_VERBS = ("explore", "export", "report")
 
 
 def _after_mujoco() -> None:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from zest_rl.analysis.curated import Curation
     from zest_rl.data.reader import Dataset
     from zest_rl.evaluation.evaluate import Evaluation
+    from zest_rl.explore.serving import ServedPage
     from zest_rl.export import Exported, Format
     from zest_rl.export.push import Upload
     from zest_rl.kitchen.collect import Collected
@@ -178,6 +179,43 @@ def curate(
 
     table = None if output is None else Path(output)
     return curate_id(_id(dataset), keep, source=source, output=table, dry_run=dry_run)
+
+
+def explore(
+    *datasets: AnyDataset,
+    goal: str | Path | None = None,
+    output: str | Path = "goals",
+    port: int = 0,
+    browser: bool = True,
+    **flags: Any,
+) -> ServedPage:
+    """Open a page on which pictures become the curves of all episodes; it is served meanwhile.
+
+    See `zest_rl.explore.serving.ServedPage`: close it when you are done, or ``wait()`` at the end of a script.
+
+    Args:
+        *datasets: any that `zest relabel` takes.
+        goal: folder of pictures, or sentences, to begin with.
+        output: folder that gets a folder for each goal that is saved.
+        port: of 127.0.0.1; 0: any that is free.
+        browser: open the page.
+        **flags: what is seen, as in `relabel`: frames, camera, env, robot, look_at, views, show_robot, tolerance,
+            skip_incomplete, masks, embedder, precision, device, backend, n_workers.
+    """
+    import webbrowser
+
+    from zest_rl.explore.background import Choice
+    from zest_rl.explore.serving import ServedPage
+
+    def command(verb: str, arguments: Mapping[str, Any]) -> str:
+        return f"zest_rl.{verb}({', '.join(f'{name}={value!r}' for name, value in arguments.items())})"
+
+    choices = [Choice(_id(dataset), flags) for dataset in datasets]
+    spec = None if goal is None else str(goal)
+    page = ServedPage(choices, goal=spec, output=Path(output), port=port, command=command)
+    if browser:
+        webbrowser.open(page.address)
+    return page
 
 
 class Trainer(NamedTuple):

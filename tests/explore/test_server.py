@@ -17,8 +17,8 @@ from PIL import Image
 from starlette.testclient import TestClient
 
 from zest_rl.analysis.inspection import inspect
+from zest_rl.cli import curate, relabel
 from zest_rl.cli.arguments import words_of
-from zest_rl.cli.relabel.arguments import Config
 from zest_rl.data.reader import open_dataset
 from zest_rl.explore import shelf as shelves
 from zest_rl.explore.background import Choice
@@ -33,8 +33,9 @@ TOKEN, HOST = "a-token", "127.0.0.1:8000"
 JSON = {"content-type": "application/json"}
 
 
-def command(options: Any) -> str:
-    return shlex.join(["zest", "relabel", *words_of(Config(**options))])
+def command(verb: str, arguments: Any) -> str:
+    config_class = {"relabel": relabel.Config, "curate": curate.Config}[verb]
+    return shlex.join(["zest", verb, *words_of(config_class(**arguments))])
 
 
 def open_page(dataset: str, folder: Path, studio: Executor) -> Page:

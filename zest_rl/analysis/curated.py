@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from zest_rl.analysis.curation import RankedEpisode, rank_episodes
+from zest_rl.analysis.curation import RankedEpisode, n_to_keep, rank_episodes
 from zest_rl.analysis.curation_quality import CurationQuality, measure_curation
 from zest_rl.analysis.recordings import open_recording
 from zest_rl.data.folders import exists
@@ -110,7 +110,11 @@ def curate(
             raise BadInput(f"{dataset_id} has the scores of other episodes (--shuffle); relabel without, curate that")
         all_scores, all_rewards = ds.scores(), ds.rewards()
         ranking = rank_episodes(all_scores)
-        n, n_kept = len(ranking), _n_kept(keep, len(ranking))
+        n, n_kept = len(ranking), n_to_keep(keep, len(ranking))
+        if n == 1:
+            raise BadInput("a dataset must have at least 2 episodes to drop some, got 1; record more")
+        if n_kept == n:
+            raise BadInput(f"--keep {keep} of {n} episodes drops none; give at most {1 - 1 / n:.4g}")
         quality = measure_curation(ds, ranking, n - n_kept)
         recording = None if source is None else open_recording(source, record)
         numbers = tuple(range(n)) if record.curate is None else record.curate.episodes
@@ -134,20 +138,6 @@ def curate(
     dropped = sorted(set(range(len(recording.names))) - set(kept))
     masks, command = recording.write_curation(kept, dropped, table.with_suffix(".hdf5"))
     return replace(curation, masks=masks, command=command)
-
-
-def _n_kept(keep: float, n: int) -> int:
-    """Return how many of n episodes are kept.
-
-    Raises:
-        BadInput: all of them.
-    """
-    n_kept = max(1, round(keep * n))
-    if n == 1:
-        raise BadInput("a dataset must have at least 2 episodes to drop some, got 1; record more")
-    if n_kept == n:
-        raise BadInput(f"--keep {keep} of {n} episodes drops none; give at most {1 - 1 / n:.4g}")
-    return n_kept
 
 
 def _write_table(path: Path, rows: list[dict[str, Any]]) -> None:

@@ -91,3 +91,8 @@ def rank_episodes(scores: Sequence[FloatArray]) -> list[RankedEpisode]:
         )
         for i in np.argsort(-worth, kind="stable")
     ]
+
+
+def n_to_keep(share: float, n: int) -> int:
+    """Return how many of n episodes are kept: that share, rounded, but one at least."""
+    return max(1, round(share * n))

@@ -129,6 +129,28 @@ def measure_rewards(
         still: (T,) per episode, whether the frame equals the first one; None where that is unknown.
         truth: ground truth per episode; None where there is none.
     """
+    figures = deciding_figures(rewards, scores, frames, still, truth)
+    if truth is not None:
+        returns, after_actions = reward_quality.returns_of(rewards), [episode[1:] for episode in scores]
+        figures |= {
+            "kendall": reward_quality.kendall(returns, true_returns(truth)),
+            "epic": reward_quality.epic_distance(after_actions, [episode.rewards for episode in truth]),
+        }
+        told = [episode.success for episode in truth if episode.success is not None]
+        if told:
+            figures["auprc"] = reward_quality.average_precision(returns, np.array(told))
+            figures["successes"] = statistics.wilson(sum(told), len(told))
+    return figures
+
+
+def deciding_figures(
+    rewards: list[FloatArray],
+    scores: list[FloatArray],
+    frames: list[NDArray[np.float64]] | None,
+    still: list[NDArray[np.bool_]] | None,
+    truth: list[GroundTruth] | None,
+) -> dict[str, Estimate]:
+    """Return those figures of `measure_rewards` that warnings and the verdict depend on, with the same arguments."""
     after_actions = [episode[1:] for episode in scores]
     figures = {
         "value_order": reward_quality.value_order(after_actions),
@@ -143,16 +165,8 @@ def measure_rewards(
         figures["contradictory"] = reward_quality.share_contradictory(after_actions, frames)
     if truth is not None:
         returns, targets = reward_quality.returns_of(rewards), true_returns(truth)
-        figures |= {
-            "spearman": statistics.spearman(returns, targets),
-            "kendall": reward_quality.kendall(returns, targets),
-            "pairwise": reward_quality.pairwise_accuracy(returns, targets),
-            "epic": reward_quality.epic_distance(after_actions, [episode.rewards for episode in truth]),
-        }
-        told = [episode.success for episode in truth if episode.success is not None]
-        if told:
-            figures["auprc"] = reward_quality.average_precision(returns, np.array(told))
-            figures["successes"] = statistics.wilson(sum(told), len(told))
+        figures["spearman"] = statistics.spearman(returns, targets)
+        figures["pairwise"] = reward_quality.pairwise_accuracy(returns, targets)
     return figures
 
 

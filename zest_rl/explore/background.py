@@ -8,17 +8,24 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from zest_rl.errors import ZestError
-from zest_rl.rewards.embeddings import EpisodeEmbeddings
-from zest_rl.rewards.preview import seen_source
-from zest_rl.rewards.relabel import open_embeddings
+from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime.parallel import cause_of_death, prepare_child, starting_children
-from zest_rl.sources import Source
+
+if TYPE_CHECKING:
+    from zest_rl.rewards.embeddings import EpisodeEmbeddings
+    from zest_rl.sources import Source
 
 STOPS_WITHIN = 10.0
 """Seconds."""
+EMBEDDING = {"embedder": "efficientnet-lite0", "precision": "auto", "device": "auto", "backend": "auto"}
+"""Arguments of `open_embeddings`, with their defaults."""
+OPTIONS = (
+    "frames", "camera", "env", "robot", "look_at", "views", "show_robot", "tolerance", "skip_incomplete", "masks",
+    "n_workers", *EMBEDDING,
+)  # fmt: skip
+"""Arguments of `zest_rl.rewards.relabel.relabel` that say what is seen."""
 
 
 @dataclass(frozen=True)
@@ -27,14 +34,24 @@ class Choice:
 
     dataset: str
     options: Mapping[str, Any]
-    """Arguments of `zest_rl.rewards.relabel.relabel`; ``embedder``, ``precision``, ``device`` and ``backend`` are among
-    them."""
+    """Some of `OPTIONS`, by name."""
+
+    def __post_init__(self) -> None:
+        if unknown := self.options.keys() - set(OPTIONS):
+            raise BadInput(f"unknown argument {min(unknown)!r}; {nearest(min(unknown), OPTIONS)}")
+
+    @property
+    def embedding(self) -> dict[str, Any]:
+        """The arguments of `EMBEDDING`, in that order."""
+        return {name: self.options.get(name, default) for name, default in EMBEDDING.items()}
 
     def find(self) -> tuple[Source, EpisodeEmbeddings]:
         """Find episodes and frames, and open the cache; raises as `open_source` and `open_embeddings`."""
+        from zest_rl.rewards.preview import seen_source  # takes a second, in which the server starts, too
+        from zest_rl.rewards.relabel import open_embeddings
+
         source = seen_source(self.dataset, **self.options)
-        embedding = {name: self.options[name] for name in ("embedder", "precision", "device", "backend")}
-        return source, open_embeddings(source, n_workers=self.options.get("n_workers"), **embedding)
+        return source, open_embeddings(source, n_workers=self.options.get("n_workers"), **self.embedding)
 
 
 def _stop(number: int, frame: FrameType | None) -> None:

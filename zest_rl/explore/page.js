@@ -369,7 +369,7 @@ async function refresh(of) {
   $("#bar .note").textContent = facts.problem ? `${ready}. ${facts.problem}` : ready;
   if (facts.ready > before && question() !== null) await changed();
   const isOver = facts.ready === all || (facts.problem && facts.ready === before);
-  if (!isOver) setTimeout(() => attempt(() => refresh(of)), facts.ready > before ? 50 : 700);
+  if (!isOver) setTimeout(() => attempt(() => refresh(of)), facts.ready > before ? 50 : 250);
 }
 
 async function start(index) {

@@ -8,13 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import json
-import secrets
-import socket
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,40 +18,28 @@ from typing import Any, TypeVar
 import numpy as np
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.responses import JSONResponse, Response
 from starlette.routing import Mount, Route
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import ASGIApp
 
 from zest_rl.data.images import decode_image
 from zest_rl.errors import BadInput, ZestError
-from zest_rl.explore.background import BackgroundEmbedding, Choice
-from zest_rl.explore.films import drawing_thread
+from zest_rl.explore.guard import Guard
 from zest_rl.explore.session import Ask, Session
 from zest_rl.explore.shelf import Shelf
 from zest_rl.kitchen.videos import FPS
 from zest_rl.metrics.reward_quality import order_in_time
-from zest_rl.rewards.embeddings import shared_embedder
-from zest_rl.rewards.episode_goals import read_source_goal
 from zest_rl.rewards.goals import GoalSpec
-from zest_rl.rewards.relabel import relabel
 from zest_rl.runtime.records import from_json
 
 T = TypeVar("T")
+Command = Callable[[str, Mapping[str, Any]], str]
+"""Name of a verb and its arguments → what to type to do the same."""
 
 MAX_PICTURE, MAX_JSON = 40_000_000, 1_000_000
 """Bytes of a request."""
-HEADERS = {
-    "content-security-policy": "default-src 'none'; img-src 'self' data:; style-src 'self'; script-src 'self'; "
-    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
-    "cross-origin-opener-policy": "same-origin",
-    "cross-origin-resource-policy": "same-origin",
-    "referrer-policy": "no-referrer",
-    "x-content-type-options": "nosniff",
-    "cache-control": "no-store",
-}
 _ASSETS = {
     "": ("zest_rl.explore", "page.html", "text/html"),
     "page.js": ("zest_rl.explore", "page.js", "text/javascript"),
@@ -63,33 +47,6 @@ _ASSETS = {
     "page.css": ("zest_rl.explore", "page.css", "text/css"),
     "report.css": ("zest_rl.report", "style.css", "text/css"),
 }
-
-
-class Guard:
-    """Lets a request through that knows the token and comes from a page of this server or from none."""
-
-    def __init__(self, app: ASGIApp, token: str, hosts: Sequence[str]) -> None:
-        """`hosts` are the server's own names, with its port."""
-        self._app, self._token, self._hosts = app, token, hosts
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer 403 or 404 to all others."""
-        headers = Headers(scope=scope)
-        origins = [f"http://{host}" for host in self._hosts]
-        if headers.get("host") not in self._hosts or headers.get("origin", origins[0]) not in origins:
-            await PlainTextResponse("this page is for this machine alone", 403)(scope, receive, send)
-            return
-        given = scope["path"].split("/")[1]
-        if not secrets.compare_digest(given.encode(), self._token.encode()):
-            await PlainTextResponse("zest explore prints the address of its page", 404)(scope, receive, send)
-            return
-
-        async def send_guarded(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(HEADERS)
-            await send(message)
-
-        await self._app(scope, receive, send_guarded)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +59,7 @@ class Page:
     """One thread, in which frames are drawn: a GL context belongs to the thread that opened it."""
     output: Path
     """Folder of goals that are saved."""
-    command: Callable[[Mapping[str, Any]], str]
-    """Arguments of `relabel` → the command line that does the same."""
+    command: Command
     goal: GoalSpec | None = None
     """That the page begins with."""
 
@@ -119,6 +75,7 @@ class Page:
             "/take/{dataset:int}/{episode:int}/{step:int}": self.take,
             "/scores/{dataset:int}": self.scores,
             "/verdict/{dataset:int}": self.verdict,
+            "/proposal/{dataset:int}": self.proposal,
             "/curves/{dataset:int}/{episode:int}": self.curves,
             "/goal/{dataset:int}": self.save_goal,
             "/save/{dataset:int}": self.save,
@@ -185,12 +142,17 @@ class Page:
 
         def work() -> dict[str, Any]:
             scored, episodes = session.score(ask), []
-            for number in sorted(scored.compared):
-                curve, rewards = scored.scores(number), scored.rewards(number)
-                facts = {"return": rewards.sum(dtype=np.float64), "end": curve[-1], "order": order_in_time(curve[1:])}
-                figures = {name: _number(value) for name, value in facts.items()}
-                figures["disagreement"] = _number(scored.disagreement(number))
-                episodes.append({"episode": number, "curve": _numbers(curve), **figures})
+            for ranked in sorted(scored.ranking(), key=lambda each: each.index):
+                curve, rewards = scored.scores(ranked.index), scored.rewards(ranked.index)
+                figures = {
+                    "return": rewards.sum(dtype=np.float64),
+                    "end": curve[-1],
+                    "order": order_in_time(curve[1:]),
+                    "worth": ranked.worth,
+                    "disagreement": scored.disagreement(ranked.index),
+                }
+                numbers = {name: _number(value) for name, value in figures.items()}
+                episodes.append({"episode": ranked.index, "curve": _numbers(curve), "words": ranked.words, **numbers})
             return {"episodes": episodes, "kept": list(scored.kept)}
 
         return JSONResponse(await run_in_threadpool(work))
@@ -207,6 +169,16 @@ class Page:
             for name, estimate in verdict.figures.items()
         }
         return JSONResponse({"advice": verdict.advice, "why": verdict.why, "figures": figures, "warnings": warnings})
+
+    async def proposal(self, request: Request) -> Response:
+        """Name the episodes to drop, and what to type to drop them once the relabeled dataset is saved."""
+        session, values = self._session(request), await _json(request)
+        keep, ask = values.pop("keep", None), _ask_of(values)
+        if not isinstance(keep, int | float) or not 0 < keep <= 1:
+            raise BadInput(f"keep must be above 0 and at most 1, got {keep!r}")
+        dropped, saved = await run_in_threadpool(session.proposal, ask, keep)
+        command = self.command("curate", {"dataset": saved, "keep": keep}) if saved and dropped else None
+        return JSONResponse({"dropped": dropped, "command": command})
 
     async def curves(self, request: Request) -> Response:
         """Score one episode by all views and goals together, and by each of them alone."""
@@ -229,16 +201,15 @@ class Page:
         """Write the goal's pictures as a folder."""
         session, ask = self._session(request), await _ask(request)
         goal = await run_in_threadpool(session.save_goal, ask, self.output)
-        return JSONResponse({"goal": goal, "command": self.command(session.relabel_options(ask, goal))})
+        return JSONResponse({"goal": goal, "command": self.command("relabel", session.relabel_options(ask, goal))})
 
     async def save(self, request: Request) -> Response:
         """Write the goal and the relabeled dataset."""
         session, ask = self._session(request), await _ask(request)
         if len(session.ready) < len(session.n_steps):
             raise BadInput("a dataset is saved when all of its episodes are embedded; wait a moment")
-        options = session.relabel_options(ask, await run_in_threadpool(session.save_goal, ask, self.output))
-        relabeled = await self._in_studio(lambda: relabel(**options))
-        return JSONResponse({"dataset": relabeled.dataset_id, "command": self.command(options)})
+        dataset, options = await self._in_studio(lambda: session.save(ask, self.output))
+        return JSONResponse({"dataset": dataset, "command": self.command("relabel", options)})
 
     async def _in_studio(self, work: Callable[[], T]) -> T:
         return await asyncio.wrap_future(self.studio.submit(work))
@@ -296,8 +267,12 @@ async def _json(request: Request) -> dict[str, Any]:
 
 
 async def _ask(request: Request) -> Ask:
+    return _ask_of(await _json(request))
+
+
+def _ask_of(values: Mapping[str, Any]) -> Ask:
     try:
-        asked = from_json(Ask, await _json(request))
+        asked = from_json(Ask, values)
         return replace(asked, goal_share=float(asked.goal_share))  # 1 and 1.0 have other hashes
     except TypeError as error:
         raise BadInput(f"this is no goal: {error}") from error
@@ -318,59 +293,3 @@ def make_app(page: Page, token: str, hosts: Sequence[str]) -> ASGIApp:
     handlers: dict[Any, Any] = {HTTPException: _explain, ZestError: _explain}
     app = Starlette(routes=[Mount(f"/{token}", routes=page.routes())], exception_handlers=handlers)
     return Guard(app, token, hosts)
-
-
-def serve(
-    choices: Sequence[Choice],
-    *,
-    goal: str | None,
-    output: Path,
-    port: int,
-    command: Callable[[Mapping[str, Any]], str],
-    on_start: Callable[[str], None],
-) -> None:
-    """Serve the page until the process is interrupted.
-
-    Args:
-        choices: the datasets; all with one embedder.
-        goal: spec of pictures or sentences that the page begins with; None: with nothing.
-        output: folder of goals that are saved.
-        port: of 127.0.0.1; 0: any that is free.
-        command: arguments of `relabel` → the command line that does the same.
-        on_start: called with the page's address once it answers.
-
-    Raises:
-        BadInput: a dataset, its frames, the embedder or the goal does not fit; or the port is taken.
-        KeyboardInterrupt: as the process was.
-    """
-    import uvicorn
-
-    options = choices[0].options
-    embedder = shared_embedder(*(options[name] for name in ("embedder", "precision", "device", "backend")))
-    background, shelf = BackgroundEmbedding(choices), Shelf(embedder)
-    with ExitStack() as stack:
-        stack.callback(background.stop)
-        studio = stack.enter_context(drawing_thread())
-        sessions = studio.submit(
-            lambda: [Session(each, shelf, partial(background.progress, i)) for i, each in enumerate(choices)]
-        ).result()
-        begun = None if goal is None else studio.submit(read_source_goal, goal, sessions[0].source).result()
-        if begun is not None and begun.per_view:
-            raise BadInput(f"the goal {goal!r} has a pair for each view; take frames of an episode in the page instead")
-        studio.submit(embedder.embed_images, [np.zeros((8, 8, 3), np.uint8)])  # loads the network
-        token = secrets.token_urlsafe(24)
-        with socket.socket() as listening:
-            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                listening.bind(("127.0.0.1", port))
-            except OSError as error:
-                raise BadInput(
-                    f"port {port} cannot be used ({error.strerror}); leave --port out for a free one"
-                ) from error
-            listening.listen()
-            port = listening.getsockname()[1]
-            page = Page(sessions, shelf, studio, output, command, begun)
-            app = make_app(page, token, [f"{host}:{port}" for host in ("127.0.0.1", "localhost")])
-            on_start(f"http://127.0.0.1:{port}/{token}/")
-            settings: dict[str, Any] = {"access_log": False, "log_level": "warning", "lifespan": "off", "ws": "none"}
-            uvicorn.Server(uvicorn.Config(app, timeout_graceful_shutdown=1, **settings)).run(sockets=[listening])

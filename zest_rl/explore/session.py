@@ -5,14 +5,15 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from zest_rl.analysis.curation import RankedEpisode, n_to_keep, rank_episodes
 from zest_rl.analysis.inspection import rendered_frames, unchanged
-from zest_rl.analysis.reward_figures import VIEW_CANNOT_TELL, measure_rewards, reward_warnings
+from zest_rl.analysis.reward_figures import VIEW_CANNOT_TELL, deciding_figures, reward_warnings
 from zest_rl.analysis.verdict import Verdict, judge
 from zest_rl.data.reader import open_dataset
 from zest_rl.data.writer import DatasetCopy, Trajectories
@@ -24,7 +25,7 @@ from zest_rl.metrics.statistics import MIN_EPISODES_TO_RANK
 from zest_rl.rewards.embeddings import EmbeddedEpisode
 from zest_rl.rewards.episode_goals import write_pictures
 from zest_rl.rewards.goals import GoalSpec
-from zest_rl.rewards.relabel import rewards_from_scores, view_cannot_tell
+from zest_rl.rewards.relabel import relabel, rewards_from_scores, view_cannot_tell
 from zest_rl.rewards.scorer import Scorer, ScorerConfig
 from zest_rl.rewards.scores import (
     Doubles,
@@ -91,6 +92,12 @@ class Scored:
         """Reward one episode: (T,)."""
         return rewards_from_scores(self.scores(episode), self.ask.reward)
 
+    def ranking(self) -> list[RankedEpisode]:
+        """Rank the episodes as `zest curate` does, the best first."""
+        episodes = sorted(self.compared)
+        ranked = rank_episodes([self.scores(episode) for episode in episodes]) if episodes else []
+        return [replace(each, index=episodes[each.index]) for each in ranked]
+
     def disagreement(self, episode: int) -> float:
         """Standard deviation of the scores by each view and goal alone, averaged over frames."""
         each = alone(self.compared[episode][..., self.kept], self.ask.features)
@@ -119,6 +126,8 @@ class Session:
         self.ready = dict[int, EmbeddedEpisode]()
         self._progress = progress
         self._films = dict[int, Film]()
+        self._saved = dict[Ask, str]()
+        """Goal → the dataset that was relabeled by it."""
         self._lock = threading.Lock()
         self._key: object = None
         self._compared = dict[int, Doubles]()
@@ -183,10 +192,16 @@ class Session:
         elif (ask.features, ask.similarity) == ("delta", "cos"):
             still = unchanged(scores)
         truth = None if self.truth is None else [self.truth[e] for e in chosen]
-        figures = measure_rewards(rewards, scores, frames, still, truth)
+        figures = deciding_figures(rewards, scores, frames, still, truth)
         blind = view_cannot_tell(scored.scorer, source, [self.ready[e] for e in chosen])
         warnings = [*reward_warnings(rewards, figures), *([VIEW_CANNOT_TELL] if blind else [])]
         return judge(rewards, figures, view_cannot_tell=blind), warnings
+
+    def proposal(self, ask: Ask, keep: float) -> tuple[list[int], str | None]:
+        """Return the episodes that `zest curate` would drop, the worst first, and the saved dataset of this goal."""
+        ranking = self.score(ask).ranking()
+        worst_first = [each.index for each in reversed(ranking[n_to_keep(keep, len(ranking)) :])]
+        return worst_first, self._saved.get(ask)
 
     def film(self, episode: int) -> Film:
         """Return the pictures of an episode; the `FILMS` that were asked for last are kept."""
@@ -212,6 +227,12 @@ class Session:
                 with artifacts.staged_folder(path) as staging:
                     write_pictures(staging, goal)
         return str(path)
+
+    def save(self, ask: Ask, folder: Path) -> tuple[str, dict[str, Any]]:
+        """Write the goal and the dataset that is relabeled by it; return its id, and the arguments of `relabel`."""
+        options = self.relabel_options(ask, self.save_goal(ask, folder))
+        self._saved[ask] = relabel(**options).dataset_id
+        return self._saved[ask], options
 
     def relabel_options(self, ask: Ask, goal: str) -> dict[str, Any]:
         """Return the arguments of `zest relabel` for a goal that `save_goal` wrote."""

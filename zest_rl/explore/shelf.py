@@ -27,6 +27,12 @@ class Shelf:
         self._pictures = dict[str, Frame]()
         self._embeddings = dict[tuple[bool, str], FloatArray]()
 
+    def warm_up(self) -> None:
+        """Load the network and what judges scores, so that the first picture that is dropped need not wait."""
+        import scipy.stats  # noqa: F401
+
+        self.embedder.embed_images([np.zeros((8, 8, 3), np.uint8)])
+
     def add(self, picture: Frame) -> str:
         """Keep a picture (H, W, 3), and return its name.
 

@@ -13,32 +13,22 @@ __all__ = ["Config", "run"]
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Serve until Ctrl-C."""
-    import importlib.util
+    import importlib
     import shlex
     import webbrowser
 
     from zest_rl.cli.arguments import words_of
-    from zest_rl.cli.relabel.arguments import Config as RelabelConfig
-    from zest_rl.errors import BadInput, ZestError
+    from zest_rl.explore.background import OPTIONS, Choice
+    from zest_rl.explore.serving import opened_page
 
-    if missing := [name for name in ("starlette", "uvicorn") if importlib.util.find_spec(name) is None]:
-        raise ZestError(f"{' and '.join(missing)} not installed: pip install 'zest-rl[explore]'")
-    if not config.datasets:
-        raise BadInput("name at least one dataset to explore")
-    from zest_rl.explore.background import Choice
-    from zest_rl.explore.server import serve
+    def command(verb: str, arguments: Mapping[str, Any]) -> str:
+        config_class = importlib.import_module(f"zest_rl.cli.{verb}").Config
+        return shlex.join(["zest", verb, *words_of(config_class(**arguments))])
 
-    own = ("datasets", "goal", "output", "port", "browser")
-    options = {name: value for name, value in vars(config).items() if name not in own}
-
-    def command(arguments: Mapping[str, Any]) -> str:
-        return shlex.join(["zest", "relabel", *words_of(RelabelConfig(**arguments))])
-
-    def tell(address: str) -> None:
-        ui.say(f"{address}\nthe page is there until Ctrl-C")
+    choices = [Choice(dataset, {name: getattr(config, name) for name in OPTIONS}) for dataset in config.datasets]
+    with opened_page(choices, goal=config.goal, output=config.output, port=config.port, command=command) as page:
+        ui.say(f"{page.address}\nthe page is there until Ctrl-C")
         if config.browser:
-            webbrowser.open(address)
-
-    choices = [Choice(dataset, options) for dataset in config.datasets]
-    serve(choices, goal=config.goal, output=config.output, port=config.port, command=command, on_start=tell)
+            webbrowser.open(page.address)
+        page.run()
     return {}
