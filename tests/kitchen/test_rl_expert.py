@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -20,6 +25,7 @@ from zest_rl.kitchen.rl_expert import WEIGHTS, RLExpert, Senses, make_rl_expert,
 from zest_rl.kitchen.rl_training import ShapedKitchen, shaped_reward, train
 from zest_rl.kitchen.tasks import TASKS
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.arrays import read_arrays
 
 RANDOMIZED = Behaviour("sdoor", "rl", noise_max=0.3)
 
@@ -119,9 +125,51 @@ def test_training_writes_the_weights_and_their_record_and_the_same_seed_gives_th
     records = [train("sdoor", 3, 120, tmp_path / name) for name in ("one", "other")]
     assert artifacts.read_json(tmp_path / "one" / "sdoor.json") == records[0]
     assert records[0]["weights_sha256"] == records[1]["weights_sha256"]
+    assert {path.name for path in (tmp_path / "one").iterdir()} == {"sdoor.json", "sdoor.safetensors"}
     env = gymnasium.make(env_spec("sdoor"))
     env.reset(seed=0)
     assert RLExpert(env.unwrapped, load_file(tmp_path / "one" / "sdoor.safetensors")).act().shape == (ACT_DIM,)
+
+
+ENDLESS = """
+import sys
+from pathlib import Path
+from zest_rl.kitchen import rl_training
+rl_training.CHECK_EVERY, rl_training.CHECK_STARTS, rl_training.TEST_STARTS = 100, range(1), range(10**6)
+rl_training.SAC["learning_starts"] = 60
+rl_training.train("sdoor", 3, int(sys.argv[2]), Path(sys.argv[1]))
+"""
+"""A training with a check after each episode, which is still at its last judgement when it is killed."""
+
+
+def train_and_kill(folder: Path, n_steps: int, killed_after: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Kill a training after a checkpoint of so many steps; return the arrays of the checkpoint and the rest of it."""
+    process = subprocess.Popen([sys.executable, "-c", ENDLESS, str(folder), str(n_steps)], stderr=subprocess.DEVNULL)
+    while True:
+        assert process.poll() is None
+        arrays = read_arrays(folder / "sdoor.checkpoint.npz")
+        told = {} if arrays is None else json.loads(arrays.pop("told").tobytes())
+        if arrays is not None and told["progress"]["step"] >= killed_after:
+            break
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    return arrays, told
+
+
+@pytest.mark.slow
+def test_a_training_that_is_killed_goes_on_by_the_same_command_as_if_nothing_had_been(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    train_and_kill(tmp_path / "cut", 300, 100)
+    arrays, told = train_and_kill(tmp_path / "cut", 300, 300)
+    whole_arrays, whole = train_and_kill(tmp_path / "whole", 300, 300)
+    del told["progress"]["seconds"], whole["progress"]["seconds"]
+    assert told == whole
+    assert arrays.keys() == whole_arrays.keys()
+    for name, array in whole_arrays.items():
+        np.testing.assert_array_equal(arrays[name], array, err_msg=name)
+    with pytest.raises(BadInput, match="with --seed 3 --steps 300, but --seed 4 --steps 300 is asked for; ask for the"):
+        train("sdoor", 4, 300, tmp_path / "cut")
 
 
 def test_what_an_expert_of_rl_cannot_do_is_refused() -> None:

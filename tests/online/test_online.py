@@ -23,11 +23,12 @@ from zest_rl.agents.online import PPO, SAC, TRPO, CorrectedPolicy
 from zest_rl.data.reader import open_dataset
 from zest_rl.errors import BadInput, Notice, ZestError
 from zest_rl.evaluation.environments import find_environment
-from zest_rl.online.algorithms import SymmetricReplay, build, mean_network, restore, state_of
+from zest_rl.online.algorithms import SymmetricReplay, build, mean_network
 from zest_rl.online.environments import RewardedVecEnv, make_environments
 from zest_rl.online.learning import CHECKPOINT
 from zest_rl.online.rewards import OnlineReward, Steps, own_reward
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.learner_state import restore, state_of
 
 SMALL: dict[str, Any] = {"start_updates": 5, "hidden_size": 16, "n_layers": 1, "batch_size": 32, "n_envs": 2}
 SETTINGS = {"threads": 1, "device": "cpu", "log_every": 100}

@@ -2,7 +2,8 @@
 
 Soft actor-critic (Haarnoja et al. 2018) by stable-baselines3 on the ground truth, with a reaching term that leads the
 hand to the contact. The network that solves most of 20 starts, and of these the one with the largest return, is kept
-and judged on 100 others. The result is the same for the same seed, versions and processor.
+and judged on 100 others. The result is the same for the same seed, versions and processor, also where the training was
+killed: the same command goes on from ``TASK.checkpoint.npz``, which holds all that changes, as arrays.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import argparse
 import json
 import sys
 import time
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,12 +21,14 @@ import zest_rl.runtime.load_order  # noqa: F401  # isort: skip
 import gymnasium
 import numpy as np
 
-from zest_rl.errors import ZestError
+from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen.env import ARM_DIM, HORIZON, KitchenEnv, env_spec
 from zest_rl.kitchen.experts import kitchen_of
 from zest_rl.kitchen.rl_expert import FEATURE_DIM, WEIGHTS, RLExpert, Senses, Weights
 from zest_rl.kitchen.tasks import SUCCESS_PROGRESS, TASKS
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.arrays import read_arrays, write_arrays
+from zest_rl.runtime.records import from_json, reading_record
 from zest_rl.types import FloatArray
 
 N_STEPS = 40_000
@@ -37,7 +41,6 @@ SAC: dict[str, Any] = {
     "n_steps": 3,
     "learning_rate": 7e-4,
     "learning_starts": 1000,
-    "buffer_size": N_STEPS,
     "target_entropy": -4.0,  # with the usual -9 the exploration ends before the hand finds the handle
     "policy_kwargs": {"net_arch": [128, 128]},
 }
@@ -55,6 +58,7 @@ class ShapedKitchen(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatA
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[FloatArray, Any]:
         """Start an episode."""
+        self.before_reset = self.kitchen.np_random.bit_generator.state  # from which this episode can be started again
         _, info = self.env.reset(seed=seed, options=options)
         return self._senses.features(), info
 
@@ -106,14 +110,35 @@ def measure(weights: Weights, task: str, starts: range) -> tuple[float, float]:
     return float(np.mean(successes)), float(np.mean(returns))
 
 
+@dataclass
+class Progress:
+    """How far a training has come, besides what its networks have learned."""
+
+    seed: int
+    n_steps: int
+    """Asked for."""
+    step: int = 0
+    """Done."""
+    solved: int = 0
+    """Checks in a row at which all starts were solved."""
+    best: tuple[float, float] = (-1.0, 0.0)
+    """Success and return of the weights that are kept."""
+    kept_at: int = 0
+    """Step."""
+    seconds: float = 0.0
+
+
 def train(task: str, seed: int, n_steps: int, folder: Path) -> dict[str, Any]:
-    """Train an expert; write ``folder/TASK.safetensors`` whenever it is better than before, and last the record of it.
+    """Train an expert, or go on with a training that was killed; write the weights, and last the record of them.
+
+    ``folder/TASK.safetensors`` is written whenever it is better than before.
 
     Returns:
         The record, as in ``folder/TASK.json``.
 
     Raises:
-        ZestError: stable-baselines3 is not installed.
+        BadInput: the folder has a checkpoint of another seed or number of steps.
+        ZestError: stable-baselines3 is not installed, or the checkpoint is damaged.
     """
     try:
         from stable_baselines3 import SAC as SoftActorCritic
@@ -123,28 +148,32 @@ def train(task: str, seed: int, n_steps: int, folder: Path) -> dict[str, Any]:
     from safetensors.numpy import save
 
     torch.set_num_threads(1)  # networks this small are not faster with more
-    start = time.monotonic()
-    model = SoftActorCritic("MlpPolicy", ShapedKitchen(task), seed=seed, device="cpu", **SAC)
-    best: tuple[float, float] = (-1.0, 0.0)
-    solved = 0
-    for step in range(CHECK_EVERY, n_steps + 1, CHECK_EVERY):
+    env, checkpoint = ShapedKitchen(task), folder / f"{task}.checkpoint.npz"
+    model = SoftActorCritic("MlpPolicy", env, seed=seed, device="cpu", buffer_size=n_steps + 1, **SAC)
+    progress, kept = Progress(seed, n_steps), dict[str, FloatArray]()
+    if checkpoint.exists():
+        progress, kept = _resume(checkpoint, model, env, progress)
+        print(f"{task}: goes on after {progress.step} steps", file=sys.stderr, flush=True)
+    start = time.monotonic() - progress.seconds
+    while progress.step + CHECK_EVERY <= n_steps and progress.solved < ENOUGH:
         model.learn(CHECK_EVERY, reset_num_timesteps=False)
+        progress.step += CHECK_EVERY
         weights = {name: tensor.numpy().copy() for name, tensor in model.actor.state_dict().items()}
         found = measure(weights, task, CHECK_STARTS)
-        print(f"{task}: {step} steps, {time.monotonic() - start:.0f} s: success {found[0]:.0%}, return {found[1]:.2f}",
+        progress.seconds = time.monotonic() - start
+        print(f"{task}: {progress.step} steps, {progress.seconds:.0f} s: success {found[0]:.0%}, return {found[1]:.2f}",
               file=sys.stderr, flush=True)  # fmt: skip
-        if found > best:
-            best, kept, kept_at = found, weights, step
+        if found > progress.best:
+            progress.best, progress.kept_at, kept = found, progress.step, weights
             artifacts.write_bytes(folder / f"{task}.safetensors", save(kept))
-        solved = solved + 1 if found[0] == 1.0 else 0
-        if solved == ENOUGH:
-            break
+        progress.solved = progress.solved + 1 if found[0] == 1.0 else 0
+        _save(checkpoint, model, env, progress, kept)
     success, episode_return = measure(kept, task, TEST_STARTS)
     record = {
         "task": task,
         "command": f"python -m zest_rl.kitchen.rl_training {task} --seed {seed} --steps {n_steps}",
         "seed": seed,
-        "kept_at_step": kept_at,
+        "kept_at_step": progress.kept_at,
         "wall_seconds": round(time.monotonic() - start),
         "n_starts": len(TEST_STARTS),
         "success": success,
@@ -154,7 +183,57 @@ def train(task: str, seed: int, n_steps: int, folder: Path) -> dict[str, Any]:
         "revision": artifacts.git_revision(),
     }
     artifacts.write_json(folder / f"{task}.json", record)
+    checkpoint.unlink(missing_ok=True)
     return record
+
+
+def _save(path: Path, model: Any, env: ShapedKitchen, progress: Progress, kept: Weights) -> None:
+    """Write a checkpoint at the start of an episode, as every check is: episodes have `HORIZON` steps."""
+    import torch
+
+    from zest_rl.runtime.learner_state import state_of
+
+    _, key, *numpy = np.random.get_state()  # noqa: NPY002  (stable-baselines3 draws from it)
+    told = {
+        "progress": asdict(progress),
+        "generators": {"kitchen": env.before_reset, "actions": model.action_space.np_random.bit_generator.state},
+        "numpy": numpy,
+    }
+    arrays = {f"model/{name}": array for name, array in state_of(model).items()}
+    arrays |= {f"kept/{name}": array for name, array in kept.items()}
+    arrays |= {"torch": torch.get_rng_state().numpy(), "numpy": np.asarray(key)}
+    write_arrays(path, {**arrays, "told": np.frombuffer(json.dumps(told).encode(), np.uint8)})
+
+
+def _resume(path: Path, model: Any, env: ShapedKitchen, asked: Progress) -> tuple[Progress, dict[str, FloatArray]]:
+    """Restore a new model, its environment and all random generators; return the progress and the weights kept."""
+    import torch
+
+    from zest_rl.runtime.learner_state import restore
+
+    advice = "delete it, and the training starts anew"
+    arrays = read_arrays(path)
+    if arrays is None:
+        raise ZestError(f"{path} is damaged; {advice}")
+
+    def part(prefix: str) -> dict[str, Any]:
+        return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+
+    with reading_record(path, advice):
+        told = json.loads(arrays["told"].tobytes())
+        progress = from_json(Progress, told["progress"])
+        if (progress.seed, progress.n_steps) != (asked.seed, asked.n_steps):
+            raise BadInput(
+                f"{path} is of a training that was cut short, with --seed {progress.seed} --steps {progress.n_steps}, "
+                f"but --seed {asked.seed} --steps {asked.n_steps} is asked for; ask for the same, or {advice}"
+            )
+        restore(model, part("model/"))
+        model.get_env().reset()  # uses up the seed, so that the next one draws from the generator
+        env.kitchen.np_random.bit_generator.state = told["generators"]["kitchen"]
+        model.action_space.np_random.bit_generator.state = told["generators"]["actions"]
+        torch.set_rng_state(torch.from_numpy(arrays["torch"]))
+        np.random.set_state(("MT19937", arrays["numpy"], *told["numpy"]))  # noqa: NPY002
+    return progress, part("kept/")
 
 
 def main() -> None:

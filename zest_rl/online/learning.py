@@ -20,11 +20,12 @@ from zest_rl.agents.base import DataFacts
 from zest_rl.agents.online import CorrectedPolicy, OnlineConfig
 from zest_rl.errors import ZestError
 from zest_rl.evaluation.environments import RunEnvironment
-from zest_rl.online.algorithms import build, mean_network, restore, state_of
+from zest_rl.online.algorithms import build, mean_network
 from zest_rl.online.environments import RewardedVecEnv, make_environments
 from zest_rl.online.rewards import OnlineReward
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_arrays, write_arrays
+from zest_rl.runtime.learner_state import restore, state_of
 from zest_rl.runtime.records import reading_record
 from zest_rl.training.checkpoints import snapshot_folder
 from zest_rl.training.log import MetricsLog
