@@ -239,7 +239,7 @@ def test_a_learned_reward_is_of_the_same_task(collected: str, tmp_path: Path) ->
     meta["dataset"]["env_spec"] = meta["dataset"]["env_spec"].replace('"micro"', '"sdoor"')
     artifacts.write_json(trex / "meta.json", meta)
     with pytest.raises(
-        BadInput, match=r"task sdoor, but zest/kitchen-micro-tiny-v0 is of .* task micro; train it on this"
+        BadInput, match=r"task sdoor of zest/Kitchen-v1, where .* but zest/kitchen-micro-tiny-v0 is of task micro of"
     ):
         zest_rl.train("sac", collected, run_dir=tmp_path / "other", **settings)
     assert not (tmp_path / "other").exists()

@@ -122,7 +122,7 @@ class RewardedVecEnv(VecEnvWrapper):
             self._extremes = min(self._extremes[0], rewards.min()), max(self._extremes[1], rewards.max())
             if self._n_steps >= WATCHED and self._extremes[0] == self._extremes[1]:
                 warnings.warn(
-                    f"the reward was {self._extremes[0]:g} in each of the first {self._n_steps} steps: there is "
+                    f"the reward was {self._extremes[0]:zg} in each of the first {self._n_steps} steps: there is "
                     "nothing to learn from yet; start from a dataset that reaches the object (without --from-scratch)",
                     Notice,
                     stacklevel=2,

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.data.provenance import DatasetRecord
 from zest_rl.data.reader import Dataset
 from zest_rl.errors import BadInput
 from zest_rl.rewards.learned import LearnedReward
@@ -88,14 +87,7 @@ def learned_reward(run: Path, dataset: Dataset, episodes: Sequence[Episode]) -> 
         BadInput: it is no such run, or one of another environment, task or observation.
     """
     reward = LearnedReward.load(run)
-    theirs, ours = (
-        (record.env.get("id"), record.task) for record in (DatasetRecord.of_run(reward.meta), dataset.record)
-    )
-    if theirs != ours:
-        raise BadInput(
-            f"the reward of {run} is of environment {theirs[0]}, task {theirs[1]}, but {dataset.id} is of "
-            f"{ours[0]}, task {ours[1]}; train it on this dataset: zest train trex {dataset.id}"
-        )
+    reward.check_fits(dataset.record)
     return OnlineReward(lambda steps: reward.of_obs(steps.obs), [reward.of_obs(e.obs[1:]) for e in episodes])
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from zest_rl.data.folders import CARD_FILE, dataset_path, exists
-from zest_rl.data.provenance import DatasetRecord
 from zest_rl.data.reader import Dataset, open_dataset
 from zest_rl.data.writer import DatasetCopy, write_scored
 from zest_rl.errors import BadInput
@@ -56,8 +55,7 @@ def relabel_by_run(dataset_id: str, run_dir: str | Path, **options: Any) -> Rela
             "`zest train trex` on the dataset that it writes"
         )
     with open_dataset(dataset_id) as ds:
-        if (learned_in := _place(ranked)) != (here := _place(ds.record)):
-            raise BadInput(f"{run_dir} is a reward of {learned_in}, but {dataset_id} is of {here}; train one on that")
+        reward.check_fits(ds.record)
         copy, source = DatasetCopy.of(ds), ds.record.source_id
         target = _target_id(source, copy.sha256, reward)
         if exists(target):
@@ -93,11 +91,6 @@ def relabel_by_run(dataset_id: str, run_dir: str | Path, **options: Any) -> Rela
         extra=add,
     )
     return RelabeledByRun(target, dataset_path(target), already_there=False)
-
-
-def _place(record: DatasetRecord) -> str:
-    """Name the task or the environment."""
-    return record.task or str(record.env.get("id") or record.source_id)
 
 
 def _target_id(source: str, sha256: str, reward: LearnedReward) -> str:

@@ -77,6 +77,19 @@ class LearnedReward:
         """
         return DatasetRecord.of_run(self.meta)
 
+    def check_fits(self, dataset: DatasetRecord) -> None:
+        """Check that it is a reward of a dataset's environment and task.
+
+        Raises:
+            BadInput: it is of others.
+        """
+        learned, asked = _place(self.record), _place(dataset)
+        if learned != asked:
+            raise BadInput(
+                f"this reward is of {learned}, where {self.record.id} was recorded, but {dataset.id} is of {asked}; "
+                "give one that `zest train trex` learned there"
+            )
+
     @property
     def sha256(self) -> str:
         """Hash of everything that a reward depends on besides its inputs."""
@@ -128,6 +141,12 @@ class LearnedReward:
             raise BadInput(f"{self.inputs} must be finite, got NaN or infinity; has the simulation diverged?")
         normalized = standardized(inputs, self.meta["obs_mean"], self.meta["obs_std"])
         return np.stack([_forward(network, normalized) for network in self.networks])
+
+
+def _place(record: DatasetRecord) -> str:
+    """Name the environment, and the task if it has several."""
+    environment = str(record.env.get("id") or record.source_id)
+    return environment if record.task is None else f"task {record.task} of {environment}"
 
 
 def _layers(tensors: Mapping[str, FloatArray]) -> list[list[Layer]]:
