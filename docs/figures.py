@@ -32,7 +32,10 @@ STYLE = {
 
 
 def learning_curves(result: Mapping[str, Any]) -> Figure:
-    """Draw the return in training of what learns in the environment, a panel for each task; the others as levels."""
+    """Draw the return in training of what learns in the environment, a panel for each task; the others as levels.
+
+    A dot is the return of the final policies as they are evaluated, without exploring.
+    """
 
     def draw(axes: Axes, task: Mapping[str, Any]) -> None:
         colors = iter(mpl.color_sequences["tab10"])
@@ -41,6 +44,7 @@ def learning_curves(result: Mapping[str, Any]) -> Figure:
             if curve is not None:
                 color = next(colors)
                 axes.plot(curve["steps"], curve["mean"], color=color, label=name)
+                axes.plot(curve["steps"][-1], row["normalized_return"], "o", color=color)
                 if "low" in curve:
                     axes.fill_between(curve["steps"], curve["low"], curve["high"], color=color, alpha=0.15, linewidth=0)
             elif row["kind"] == "method":

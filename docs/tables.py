@@ -64,8 +64,11 @@ def _curves(name: str, result: Mapping[str, Any]) -> str:
         return ""
     times = {method: [s for task in tasks for s in task["train_seconds"][method]] for method in sorted(names)}
     mean = ", ".join(f"{method} {sum(of_all) / len(of_all) / 60:.1f} min" for method, of_all in times.items())
-    alt = "Returns of the newest 20 episodes in training; lines are means over seeds, bands their range"
-    return f"![{alt}](images/{name}.svg)\n\nOne training took, in the mean over tasks and seeds: {mean}.\n\n"
+    return (
+        f"![Returns over the steps of the trainings, one panel for each task](images/{name}.svg)\n\n"
+        "Lines are returns of the newest 20 episodes in training, which explore: means over seeds, and their range. "
+        f"Dots are the final policies as evaluated, without exploring. One training took, on average: {mean}.\n\n"
+    )
 
 
 def _source(result: Mapping[str, Any], shown: Iterable[str]) -> str:
