@@ -134,6 +134,10 @@ def test_pictures_that_are_dropped_and_frames_that_are_clicked_become_curves_and
     page.click("#save")
     page.wait_for_selector("#saved pre")
     name, command = page.inner_text("#saved b"), page.inner_text("#saved pre")
+    page.wait_for_selector("#proposal pre", state="attached")
+    assert page.text_content("#proposal pre") == f"zest curate {name}"
+    (to_drop,) = page.evaluate("[...document.querySelectorAll('.dropped')].map((cell) => cell.dataset.episode)")
+    assert page.text_content("#proposal tbody button") == to_drop
     with open_dataset(name) as ds:
         scores = ds.scores()
         path = ds.path

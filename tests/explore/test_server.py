@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from few_states import OPTIONS
+from hugging_face_files import save_hugging_face
 from PIL import Image
 from starlette.testclient import TestClient
 
@@ -38,9 +39,10 @@ def command(verb: str, arguments: Any) -> str:
     return shlex.join(["zest", verb, *words_of(config_class(**arguments))])
 
 
-def open_page(dataset: str, folder: Path, studio: Executor) -> Page:
-    shelf = Shelf(shared_embedder("efficientnet-lite0", "auto", "auto", "auto"))
-    session = Session(Choice(dataset, OPTIONS), shelf, lambda: (1.0, ""))
+def open_page(dataset: str, folder: Path, studio: Executor, options: dict[str, Any] = OPTIONS) -> Page:
+    choice = Choice(dataset, options)
+    shelf = Shelf(shared_embedder(*choice.embedding.values()))
+    session = Session(choice, shelf, lambda: (1.0, ""))
     return Page([session], shelf, studio, folder / "goals", command)
 
 
@@ -100,6 +102,53 @@ def test_what_is_saved_are_the_scores_shown_and_the_very_dataset_of_the_command_
     with open_dataset(saved["dataset"]) as ds:
         assert all(map(np.array_equal, ds.scores(), scores))
         assert all(map(np.array_equal, ds.rewards(), rewards))
+
+
+def test_the_episodes_to_drop_are_those_of_the_curate_command_that_is_printed(
+    client: TestClient, zest: Callable[..., dict[str, Any]]
+) -> None:
+    asked = ask(client)
+    proposed = client.post("proposal/0", json={**asked, "keep": 0.5}).json()
+    assert proposed["command"] is None, "nothing is relabeled yet"
+    saved = client.post("save/0", json=asked).json()["dataset"]
+    command = client.post("proposal/0", json={**asked, "keep": 0.5}).json()["command"]
+    assert command == f"zest curate {saved} --keep 0.5"
+    curated = zest(*shlex.split(command)[1:], "--dry-run")
+    assert proposed["dropped"] == curated["dropped"]
+    shown = {each["episode"]: each for each in client.post("scores/0", json=asked).json()["episodes"]}
+    for row in curated["episodes"]:
+        assert shown[row["episode"]]["words"] == row["words"]
+        assert shown[row["episode"]]["worth"] == pytest.approx(row["worth"], abs=1e-5)
+    assert client.post("proposal/0", json={**asked, "keep": 1}).json() == {"dropped": [], "command": None}
+    for unfit in (0, 1.5, "0.8", None):
+        assert "keep must be" in client.post("proposal/0", json={**asked, "keep": unfit}).json()["error"]
+
+
+def test_two_sentences_score_as_the_command_that_is_printed(
+    collected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, zest: Callable[..., dict[str, Any]]
+) -> None:
+    folder = tmp_path / "clip"
+    folder.mkdir()
+    save_hugging_face("clip", folder)
+    monkeypatch.chdir(tmp_path)
+    options = {**OPTIONS, "tolerance": 0.3, "embedder": f"transformers:{folder}", "n_workers": 1}
+    Choice(collected, options).find()[1].embed()
+    asked = {"starts": ["closed microwave"], "goals": ["open microwave"], "are_sentences": True}
+    with drawing_thread() as studio:
+        page = open_page(collected, tmp_path, studio, options)
+        client = TestClient(make_app(page, TOKEN, [HOST]), base_url=f"http://{HOST}/{TOKEN}/")
+        assert client.get("state/0").json()["reads_text"]
+        shown = client.post("scores/0", json=asked).json()["episodes"]
+        saved = client.post("save/0", json=asked).json()
+    assert "--goal 'text:closed microwave -> open microwave'" in saved["command"]
+    with open_dataset(saved["dataset"]) as ds:
+        scores, path = ds.scores(), ds.path
+    for each, score in zip(shown, scores, strict=True):
+        np.testing.assert_allclose(each["curve"], score, atol=2e-5)
+    path.rename(path.with_name("as-the-page-saved-it"))
+    assert zest(*shlex.split(saved["command"])[1:])["dataset"] == saved["dataset"]
+    with open_dataset(saved["dataset"]) as ds:
+        assert all(map(np.array_equal, ds.scores(), scores))
 
 
 def test_each_goal_and_each_view_has_its_own_curve_and_a_goal_that_is_switched_off_counts_no_more(

@@ -1,26 +1,13 @@
 // Curves as SVG: small ones without axes, and charts of an episode whose cursors move together.
 
-const SVG = "http://www.w3.org/2000/svg";
+import { digits, element } from "./elements.js";
 
-export function element(name, attributes = {}, ...children) {
-  const made = document.createElement(name);
-  for (const [key, value] of Object.entries(attributes)) {
-    if (key === "class") made.className = value;
-    else if (key in made) made[key] = value;
-    else made.setAttribute(key, value);
-  }
-  made.append(...children);
-  return made;
-}
+const SVG = "http://www.w3.org/2000/svg";
 
 function drawn(name, attributes) {
   const made = document.createElementNS(SVG, name);
   for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
   return made;
-}
-
-export function shown(value, digits = 3) {
-  return value === null || value === undefined ? "–" : value.toFixed(digits).replace("-", "−");
 }
 
 export function range(curves) {
@@ -76,8 +63,8 @@ export function chart(title, curves, onSeek) {
   });
   const box = element("div", { class: "plotted" });
   box.append(
-    element("span", { class: "high note" }, shown(bounds[1], 2)),
-    element("span", { class: "low note" }, shown(bounds[0], 2)),
+    element("span", { class: "high note" }, digits(bounds[1], 2)),
+    element("span", { class: "low note" }, digits(bounds[0], 2)),
     svg,
   );
   const seek = (event) => {
@@ -93,7 +80,7 @@ export function chart(title, curves, onSeek) {
     node: element("figure", { class: "chart-of" }, element("h3", {}, title), box, legend),
     move(step) {
       for (const side of ["x1", "x2"]) cursor.setAttribute(side, (100 * step) / Math.max(1, n - 1));
-      curves.forEach((each, i) => (outputs[i].textContent = shown(each.values[step])));
+      curves.forEach((each, i) => (outputs[i].textContent = digits(each.values[step])));
     },
   };
 }

@@ -42,10 +42,12 @@ MAX_PICTURE, MAX_JSON = 40_000_000, 1_000_000
 """Bytes of a request."""
 _ASSETS = {
     "": ("zest_rl.explore", "page.html", "text/html"),
-    "page.js": ("zest_rl.explore", "page.js", "text/javascript"),
-    "charts.js": ("zest_rl.explore", "charts.js", "text/javascript"),
     "page.css": ("zest_rl.explore", "page.css", "text/css"),
     "report.css": ("zest_rl.report", "style.css", "text/css"),
+    **{
+        f"{name}.js": ("zest_rl.explore", f"{name}.js", "text/javascript")
+        for name in ("page", "goal", "episode", "charts", "elements", "server", "state")
+    },
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -46,8 +47,8 @@ from zest_rl.types import FloatArray, GroundTruth
 
 FILMS = 4
 """Episodes whose pictures are kept."""
-AT_ONCE = 8
-"""Episodes read from the cache between two answers."""
+READING = 0.3
+"""Seconds of computing for which the cache is read between two answers."""
 
 
 @dataclass(frozen=True)
@@ -134,12 +135,13 @@ class Session:
 
     def advance(self) -> tuple[float, str]:
         """Take over a few more of the episodes that are embedded; return as `BackgroundEmbedding.progress`."""
-        progress = self._progress()
-        waiting = [episode for episode in range(len(self.n_steps)) if episode not in self.ready]
-        for episode in waiting[:AT_ONCE]:
+        progress, since = self._progress(), time.thread_time()
+        for episode in (number for number in range(len(self.n_steps)) if number not in self.ready):
             if (embedded := self._embeddings.read(episode)) is None:
                 break
             self.ready[episode] = embedded
+            if time.thread_time() - since > READING:
+                break
         return progress
 
     def score(self, ask: Ask) -> Scored:
