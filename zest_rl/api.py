@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from zest_rl.kitchen.collect import Collected
     from zest_rl.rewards.by_learned import RelabeledByRun
     from zest_rl.rewards.relabel import Relabeled
-    from zest_rl.training.loop import OnProgress
+    from zest_rl.training.request import OnProgress
 
 Progress: TypeAlias = Callable[[int, int], None]
 """Called with (parts done, parts in all)."""
@@ -234,10 +234,10 @@ def trainer(agent: str) -> Trainer:
     Raises:
         BadInput: there is no such agent.
     """
-    from zest_rl.agents import Agent, get_agent
-    from zest_rl.training.loop import RunConfig, TrainingConfig
+    from zest_rl.agents.configs import OptimizerConfig, config_of
+    from zest_rl.training.request import RunConfig, TrainingConfig
 
-    learns_from_data = isinstance(get_agent(agent), Agent)
+    learns_from_data = issubclass(config_of(agent), OptimizerConfig)
 
     def train_run(*args: Any, **kwargs: Any) -> Path:
         if learns_from_data:  # either brings a simulator, which help does without
@@ -266,13 +266,13 @@ def train(
         dataset: its rewards are the only information about quality.
         run_dir: folder of this run alone; default ``runs/DATASET-AGENT-seedN``.
         on_progress: called after every logged row.
-        **flags: the fields of `zest_rl.training.loop.TrainingConfig` (n_updates, seed, device, …) and of the agent's
-            config (`zest_rl.agents.dt.DTConfig`, …).
+        **flags: the fields of `zest_rl.training.request.TrainingConfig` (n_updates, seed, device, …) and of the agent's
+            config (`zest_rl.agents.configs.DTConfig`, …).
     """
-    from zest_rl.agents import get_agent
+    from zest_rl.agents.configs import config_of
 
     how = trainer(agent)
-    agent_config, config = _configs(flags, get_agent(agent).config, how.config)
+    agent_config, config = _configs(flags, config_of(agent), how.config)
     folder = None if run_dir is None else Path(run_dir)
     return how.train(agent, _id(dataset), agent_config, config, run_dir=folder, on_progress=on_progress)
 

@@ -142,6 +142,16 @@ def test_the_wilson_interval_follows_its_formula(k: int, n: int) -> None:
     assert 0 <= estimate.low <= rate <= estimate.high <= 1
 
 
+def test_means_intervals_and_rank_correlations_are_those_of_scipy_to_the_bit() -> None:
+    rng = np.random.default_rng(0)
+    for n in (3, 10, 50, 101):
+        values, others = rng.normal(size=(2, n)).round(1)
+        assert iqm(values) == stats.trim_mean(values, 0.25)
+        assert spearman(values, others, n_resamples=1).value == stats.spearmanr(values, others).statistic
+        interval = stats.binomtest(n // 3, n).proportion_ci(method="wilson")
+        assert (wilson(n // 3, n).low, wilson(n // 3, n).high) == (interval.low, interval.high)
+
+
 def test_a_success_rate_of_no_episodes_is_refused() -> None:
     with pytest.raises(BadInput, match="at least 1 episode"):
         wilson(0, 0)

@@ -26,8 +26,9 @@ from zest_rl.agents.rvs import RvSConfig
 from zest_rl.agents.trex import TREXConfig
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.training import loop
-from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint, snapshot_folder
+from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint
 from zest_rl.training.loop import TrainingConfig, fit
+from zest_rl.training.request import snapshot_folder
 from zest_rl.types import Episode
 
 CONFIGS: dict[str, Any] = {

@@ -1,89 +1,21 @@
-"""Algorithms: one file each, in the same order (config, model, batch, loss, act); the registry is a dict.
+"""Algorithms: one file each, in the same order (model, batch, loss, act); their flags are in `configs`.
 
-To add one, copy the file of the most similar algorithm and add a line to `AGENTS`. `foreign` is not an algorithm: it
-runs policies that other programs trained.
+To add one, copy the file of the most similar algorithm, give it a config, and add a line to `registry.AGENTS` and to
+`configs.CONFIGS`. `foreign` is not an algorithm: it runs policies that other programs trained.
 """
 
-from __future__ import annotations
+import importlib
+from typing import TYPE_CHECKING, Any
 
-from dataclasses import fields
-from pathlib import Path
-from typing import Any
-
-import safetensors.torch
-import torch
-
-from zest_rl.agents import bc, dt, foreign, online, rvs, trex
-from zest_rl.agents.base import Agent, DataFacts, Policy
-from zest_rl.embedders import find_device
-from zest_rl.errors import BadInput, nearest
-from zest_rl.runtime.artifacts import read_checked, read_json
-from zest_rl.runtime.hub import local_run
-from zest_rl.runtime.records import from_json, reading_record
-from zest_rl.runtime.trust import remember
+if TYPE_CHECKING:
+    from zest_rl.agents.base import Agent, Policy
+    from zest_rl.agents.registry import AGENTS, get_agent, load_policy
 
 __all__ = ["AGENTS", "Agent", "Policy", "get_agent", "load_policy"]
 
-AGENTS: dict[str, Agent[Any] | online.OnlineAgent] = {
-    "bc": bc.AGENT,
-    "dt": dt.AGENT,
-    "rvs": rvs.AGENT,
-    "trex": trex.AGENT,
-    "sac": online.SAC,
-    "ppo": online.PPO,
-    "trpo": online.TRPO,
-}
 
-
-def get_agent(name: str) -> Agent[Any] | online.OnlineAgent:
-    """Return the agent called `name`.
-
-    Raises:
-        BadInput: there is no such agent; the message names the nearest ones.
-    """
-    if name not in AGENTS:
-        raise BadInput(f"unknown agent {name!r}; {nearest(name, AGENTS)}")
-    return AGENTS[name]
-
-
-def load_policy(run_dir: str | Path, device: str = "cpu", *, trust: bool = False) -> Policy:
-    """Return the policy of a finished run; it acts in the precision it was trained in.
-
-    Args:
-        run_dir: the run's folder, or ``hf://OWNER/NAME`` (`zest_rl.runtime.hub.local_run`).
-        device: where the policy runs: "cpu", "cuda", "cuda:1", "mps", "auto" (CUDA where there is one, else the CPU).
-        trust: run a foreign policy that was not adopted on this machine, now and from now on.
-
-    Raises:
-        ZestError: the run is not finished, or its weights differ from those that ``meta.json`` names.
-        BadInput: there is no such device, ``meta.json`` is not as this package writes it, its agent is unknown here, or
-            a foreign policy is not trusted or cannot be read.
-    """
-    run_dir = local_run(run_dir)
-    place, path = find_device(device), run_dir / "meta.json"
-    meta: dict[str, Any] = read_json(path)
-    with reading_record(path):
-        is_foreign = meta["agent"] == foreign.FOREIGN
-        if is_foreign and trust:
-            remember("policy", meta["policy"])
-    return foreign.load(run_dir, meta, place) if is_foreign else _load(run_dir, meta, place)
-
-
-def _load(run_dir: Path, meta: dict[str, Any], device: torch.device) -> Policy:
-    with reading_record(run_dir / "meta.json"):
-        agent, sha256 = get_agent(meta["agent"]), str(meta["model_sha256"])
-        config = from_json(agent.config, meta["config"])
-        facts = from_json(DataFacts, {field.name: meta[field.name] for field in fields(DataFacts)})
-    path = run_dir / "model.safetensors"
-    weights = read_checked(path, sha256, "restore it from a copy or train again into a new folder")
-    with reading_record(run_dir / "meta.json"), torch.random.fork_rng(devices=[]):  # initial weights are replaced
-        tensors = safetensors.torch.load(weights)
-        with torch.device("meta"):  # makes no room yet
-            shapes = {name: tensor.shape for name, tensor in agent.networks(config, facts).state_dict().items()}
-        if shapes != {name: tensor.shape for name, tensor in tensors.items()}:
-            raise ValueError(f"its config is not that of {path.name}")
-        model = agent.networks(config, facts)
-        model.load_state_dict(tensors)
-    model = model.to(device).eval()
-    with reading_record(run_dir / "meta.json"):
-        return agent.policy(model, config, facts, meta, device)
+def __getattr__(name: str) -> Any:
+    """Load the registry when it is used: it imports torch, which flags and finished runs do without."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module("zest_rl.agents.registry"), name)

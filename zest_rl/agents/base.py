@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar, get_args
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from zest_rl.agents.configs import OptimizerConfig
+from zest_rl.agents.rules import LARGEST_WIDTH, check_fields, whole
 from zest_rl.data.observations import standardized
 from zest_rl.embedders import Precision, computes_bf16
 from zest_rl.errors import BadInput
@@ -125,67 +127,6 @@ def resolve_precision(precision: Precision, device: torch.device) -> Precision:
 def autocast(precision: Precision, device: torch.device) -> torch.autocast:
     """Return the context in which matrix products are computed in the resolved `precision`; the rest stays float32."""
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")
-
-
-Rule = tuple[bool, str]  # (holds, "must be …")
-Rules = Mapping[str, Rule]  # by field
-
-LARGEST_WIDTH, MOST_LAYERS, MOST_WEIGHTS = 2**14, 1000, 10**9
-LARGEST_BATCH, MOST_NETWORKS = 2**20, 100
-"""Room is made only below these bounds."""
-
-
-def whole(value: int, largest: int) -> Rule:
-    """Return the rule of a number that is counted from 1."""
-    return 1 <= value <= largest, f"1 to {largest}"
-
-
-def few_weights(n_layers: int, weights_per_layer: int, n_networks: int) -> Rule:
-    """Return the rule of a number of equal layers in each of several networks."""
-    return (
-        1 <= n_layers <= MOST_LAYERS and n_networks * n_layers * weights_per_layer <= MOST_WEIGHTS,
-        f"1 to {MOST_LAYERS}, and few enough for {MOST_WEIGHTS:,} weights in all",
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class OptimizerConfig:
-    """What the config of every agent inherits: how its networks are trained, and how many of them."""
-
-    learning_rate: float = 3e-4
-    """AdamW's step size after warm-up."""
-    weight_decay: float = 1e-4
-    """AdamW's decoupled weight decay."""
-    warmup_updates: int = 200
-    """Updates over which the step size rises linearly from 0."""
-    grad_clip: float = 0.25
-    """Largest Euclidean norm of the gradient."""
-    ema_decay: float = 0.999
-    """Largest decay of the moving average of the weights, which is what acts; 0 acts with the last weights. It rises as
-    (1 + n) / (10 + n): about the last ninth of a training is averaged, until 0.999 is reached after 9000 updates."""
-    amp: Precision = "auto"
-    """Precision of matrix products; auto is bf16 where the hardware has it."""
-    n_networks: int = 1
-    """Networks that are trained on the same batches from different initial weights; the mean of their actions acts."""
-
-    def optimizer_rules(self) -> Rules:
-        """Return the rules of these fields."""
-        return {
-            "learning_rate": (0 < self.learning_rate < float("inf"), "positive"),
-            "weight_decay": (0 <= self.weight_decay < float("inf"), "0 or positive"),
-            "warmup_updates": (self.warmup_updates >= 0, "0 or positive"),
-            "grad_clip": (0 < self.grad_clip < float("inf"), "positive"),
-            "ema_decay": (0 <= self.ema_decay < 1, "in [0, 1)"),
-            "amp": (self.amp in get_args(Precision), f"one of {', '.join(get_args(Precision))}"),
-            "n_networks": whole(self.n_networks, MOST_NETWORKS),
-        }
-
-
-def check_fields(title: str, values: Any, rules: Rules) -> None:
-    """Raise one `BadInput` that lists every field of `values` (an object with attributes) that breaks its rule."""
-    problems = [f"{f} must be {rule}, got {getattr(values, f)!r}" for f, (holds, rule) in rules.items() if not holds]
-    if problems:
-        raise BadInput(f"{title}: " + "; ".join(problems))
 
 
 def check_returns(facts: DataFacts) -> None:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,52 +24,18 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from zest_rl.agents.base import (
-    LARGEST_BATCH,
-    LARGEST_WIDTH,
     Agent,
     Batch,
     DataFacts,
-    OptimizerConfig,
     Policy,
     Sampler,
     autocast,
-    check_fields,
     check_obs,
-    few_weights,
     mean_action,
     mlp,
-    whole,
 )
+from zest_rl.agents.configs import BCConfig as BCConfig
 from zest_rl.types import Episode, FloatArray
-
-# ---------------------------------------------------------------------------------------------------------- config
-
-
-@dataclass(frozen=True)
-class BCConfig(OptimizerConfig):
-    """Behaviour cloning."""
-
-    top_fraction: float = 1.0
-    """Share of the episodes, those with the largest returns, that is cloned; 1 clones all and never reads a reward."""
-    hidden_size: int = 512
-    """Units per hidden layer."""
-    n_layers: int = 3
-    """Hidden layers."""
-    dropout: float = 0.1
-    """Share of hidden units that is zeroed while training."""
-    batch_size: int = 1280
-    """Transitions per update."""
-
-    def __post_init__(self) -> None:
-        check_fields("BC config", self, {
-            "top_fraction": (0 < self.top_fraction <= 1, "in (0, 1]"),
-            "hidden_size": whole(self.hidden_size, LARGEST_WIDTH),
-            "n_layers": few_weights(self.n_layers, self.hidden_size**2, self.n_networks),
-            "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
-            "batch_size": whole(self.batch_size, LARGEST_BATCH),
-            **self.optimizer_rules(),
-        })  # fmt: skip
-
 
 # ----------------------------------------------------------------------------------------------------------- model
 

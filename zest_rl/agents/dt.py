@@ -20,8 +20,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,71 +28,21 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from zest_rl.agents.base import (
-    LARGEST_BATCH,
-    LARGEST_WIDTH,
     Agent,
     Batch,
     DataFacts,
-    OptimizerConfig,
     Policy,
     ReturnToGo,
     Sampler,
     autocast,
-    check_fields,
     check_obs,
     check_returns,
-    few_weights,
     mean_action,
     returns_to_go,
-    whole,
 )
+from zest_rl.agents.configs import DTConfig as DTConfig
 from zest_rl.errors import BadInput
 from zest_rl.types import Episode, FloatArray
-
-# ---------------------------------------------------------------------------------------------------------- config
-
-
-Timesteps = Literal["absolute", "relative"]
-LONGEST_CONTEXT = 2048
-"""Steps; the mask of each block grows with their square."""
-
-
-@dataclass(frozen=True)
-class DTConfig(OptimizerConfig):
-    """Decision Transformer."""
-
-    condition_on_return: bool = True
-    """False zeroes the return-to-go: the same network without any information from the scores."""
-    context_len: int = 20
-    """K, the steps that the network sees."""
-    timesteps: Timesteps = "absolute"
-    """What a step's embedding counts from: the start of the episode, as in the paper, or the start of the window."""
-    hidden_size: int = 128
-    """Width of a token."""
-    n_layers: int = 3
-    """Transformer blocks."""
-    n_heads: int = 1
-    """Attention heads per block."""
-    dropout: float = 0.1
-    """Share zeroed of embeddings, residual branches and attention weights while training."""
-    batch_size: int = 64
-    """Windows of K steps per update."""
-
-    def __post_init__(self) -> None:
-        check_fields("DT config", self, {
-            "context_len": whole(self.context_len, LONGEST_CONTEXT),
-            "hidden_size": whole(self.hidden_size, LARGEST_WIDTH),
-            "n_layers": few_weights(self.n_layers, 12 * self.hidden_size**2, self.n_networks),
-            "n_heads": (
-                self.n_heads >= 1 and self.hidden_size % self.n_heads == 0,
-                f"a divisor of hidden_size ({self.hidden_size})",
-            ),
-            "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
-            "timesteps": (self.timesteps in get_args(Timesteps), f"one of {', '.join(get_args(Timesteps))}"),
-            "batch_size": whole(self.batch_size, LARGEST_BATCH // min(max(1, self.context_len), LONGEST_CONTEXT)),
-            **self.optimizer_rules(),
-        })  # fmt: skip
-
 
 # ----------------------------------------------------------------------------------------------------------- model
 

@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 
 from zest_rl.agents.base import check_obs
 from zest_rl.agents.child import PolicyProcess
+from zest_rl.agents.configs import FOREIGN
 from zest_rl.errors import BadInput, ZestError, nearest
 from zest_rl.runtime.artifacts import hash_file
 from zest_rl.runtime.files import user_path
@@ -43,8 +44,6 @@ from zest_rl.runtime.records import from_json, reading_record
 from zest_rl.runtime.trust import check_trusted
 from zest_rl.types import FloatArray
 
-FOREIGN = "foreign"
-"""Name of the agent in the ``meta.json`` of such a run."""
 ENTRY_POINTS = "zest_rl.policies"
 FAMILIES = ("torchscript", "onnx", "d3rlpy", "command")
 POLICY_FOLDER = "policy"

@@ -23,132 +23,13 @@ import torch
 from torch import Tensor, nn
 
 from zest_rl.agents.base import (
-    LARGEST_BATCH,
-    LARGEST_WIDTH,
     DataFacts,
     Policy,
-    Rules,
-    check_fields,
-    few_weights,
     mean_action,
-    whole,
 )
 from zest_rl.agents.bc import AGENT as CLONING
-from zest_rl.agents.bc import BCConfig, BCPolicy
-
-START = BCConfig(hidden_size=256, dropout=0.0, batch_size=320, learning_rate=1e-3, n_networks=2)
-"""The behaviour cloning that a policy starts from."""
-LARGEST_COUNT = 10**9
-
-# ---------------------------------------------------------------------------------------------------------- config
-
-
-@dataclass(frozen=True, kw_only=True)
-class OnlineConfig:
-    """What the algorithms share."""
-
-    n_steps: int = 10_000
-    """Steps in the environment, of all its copies together."""
-    reward: str = "own"
-    """own: what made the dataset's rewards, its scorer or its environment; truth: its environment's, which is what the
-    dataset had before it was relabeled; trex: what T-REX learns from the dataset first; or a folder of `zest train
-    trex`."""
-    from_scratch: bool = False
-    """Learn the whole action from nothing, and use the dataset for its environment, scorer and scales alone."""
-    start_updates: int = 1500
-    """Gradient steps of the behaviour cloning to start from."""
-    correction: float = 0.3
-    """Largest correction of the cloned action, in units of the action."""
-    hidden_size: int = 128
-    """Units per hidden layer, of actor and critics."""
-    n_layers: int = 2
-    """Hidden layers."""
-    learning_rate: float = 1e-3
-    """Adam's step size."""
-    gamma: float = 0.97
-    """Discount per step."""
-    batch_size: int = 256
-    """Transitions per gradient step."""
-    n_envs: int = 4
-    """Copies of the environment, stepped together."""
-    subprocesses: bool = False
-    """Run each copy in a process of its own: for many cores, or slow environments."""
-
-    def __post_init__(self) -> None:
-        check_fields(type(self).__name__, self, self.rules())
-
-    def rules(self) -> Rules:
-        """Return the rules of the fields."""
-        return {
-            "n_steps": whole(self.n_steps, LARGEST_COUNT),
-            "start_updates": whole(self.start_updates, LARGEST_COUNT),
-            "correction": (0 < self.correction <= 2, "in (0, 2]"),
-            "hidden_size": whole(self.hidden_size, LARGEST_WIDTH),
-            "n_layers": few_weights(self.n_layers, self.hidden_size**2, 1),
-            "learning_rate": (0 < self.learning_rate < float("inf"), "positive"),
-            "gamma": (0 < self.gamma < 1, "in (0, 1)"),
-            "batch_size": (2 <= self.batch_size <= LARGEST_BATCH, f"2 to {LARGEST_BATCH}"),
-            "n_envs": whole(self.n_envs, 1024),
-        }
-
-
-@dataclass(frozen=True, kw_only=True)
-class SACConfig(OnlineConfig):
-    """SAC (Haarnoja et al. 2018): off-policy, the fastest here; half of every batch is from the dataset."""
-
-    updates_per_step: int = 1
-    """Gradient steps per step in the environment."""
-    entropy: float = 1.0
-    """The entropy that is aimed at is minus this, times the action's dimensions."""
-
-    def rules(self) -> Rules:
-        """Return the rules of the fields."""
-        return {
-            **super().rules(),
-            "updates_per_step": whole(self.updates_per_step, 1024),
-            "entropy": (0 <= self.entropy < float("inf"), "0 or positive"),
-        }
-
-
-@dataclass(frozen=True, kw_only=True)
-class OnPolicyConfig(OnlineConfig):
-    """What PPO and TRPO share."""
-
-    n_steps: int = 40_000
-    batch_size: int = 250
-    """Transitions per gradient step; a divisor of the rollout."""
-    rollout: int = 2_000
-    """Steps in the environment between two updates of the policy."""
-    log_std: float = -1.0
-    """Logarithm of the correction's standard deviation at first."""
-
-    def rules(self) -> Rules:
-        """Return the rules of the fields."""
-        return {
-            **super().rules(),
-            "rollout": (2 * self.n_envs <= self.rollout <= LARGEST_COUNT, f"{2 * self.n_envs} to {LARGEST_COUNT}"),
-            "log_std": (-20 <= self.log_std <= 2, "-20 to 2"),
-        }
-
-
-@dataclass(frozen=True, kw_only=True)
-class PPOConfig(OnPolicyConfig):
-    """PPO (Schulman et al. 2017): policy gradient with clipped ratios."""
-
-    learning_rate: float = 3e-4
-
-
-@dataclass(frozen=True, kw_only=True)
-class TRPOConfig(OnPolicyConfig):
-    """TRPO (Schulman et al. 2015): natural policy gradient, the family of the paper's."""
-
-    target_kl: float = 0.01
-    """Largest mean KL divergence of an update of the policy."""
-
-    def rules(self) -> Rules:
-        """Return the rules of the fields."""
-        return {**super().rules(), "target_kl": (0 < self.target_kl < float("inf"), "positive")}
-
+from zest_rl.agents.bc import BCPolicy
+from zest_rl.agents.configs import START, OnlineConfig, PPOConfig, SACConfig, TRPOConfig
 
 # ----------------------------------------------------------------------------------------------------------- model
 

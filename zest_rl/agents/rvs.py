@@ -14,7 +14,6 @@ Deviations:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,56 +22,21 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from zest_rl.agents.base import (
-    LARGEST_BATCH,
-    LARGEST_WIDTH,
     Agent,
     Batch,
     DataFacts,
-    OptimizerConfig,
     Policy,
     ReturnToGo,
     Sampler,
     autocast,
-    check_fields,
     check_obs,
     check_returns,
-    few_weights,
     mean_action,
     mlp,
     returns_to_go,
-    whole,
 )
+from zest_rl.agents.configs import RvSConfig as RvSConfig
 from zest_rl.types import Episode, FloatArray
-
-# ---------------------------------------------------------------------------------------------------------- config
-
-
-@dataclass(frozen=True)
-class RvSConfig(OptimizerConfig):
-    """Return-conditioned MLP (RvS)."""
-
-    condition_on_return: bool = True
-    """False zeroes the return-to-go: the same network without any information from the scores."""
-    hidden_size: int = 512
-    """Units per hidden layer."""
-    n_layers: int = 3
-    """Hidden layers."""
-    dropout: float = 0.0
-    """Share of hidden units that is zeroed while training."""
-    batch_size: int = 320
-    """Transitions per update."""
-    learning_rate: float = 1e-3
-    """AdamW's step size after warm-up."""
-
-    def __post_init__(self) -> None:
-        check_fields("RvS config", self, {
-            "hidden_size": whole(self.hidden_size, LARGEST_WIDTH),
-            "n_layers": few_weights(self.n_layers, self.hidden_size**2, self.n_networks),
-            "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
-            "batch_size": whole(self.batch_size, LARGEST_BATCH),
-            **self.optimizer_rules(),
-        })  # fmt: skip
-
 
 # ----------------------------------------------------------------------------------------------------------- model
 

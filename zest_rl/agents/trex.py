@@ -14,8 +14,7 @@ What is trained is a reward, not a policy: `zest_rl.rewards.learned.LearnedRewar
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,71 +23,20 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from zest_rl.agents.base import (
-    LARGEST_BATCH,
-    LARGEST_WIDTH,
     Agent,
     Batch,
     DataFacts,
     Judge,
-    OptimizerConfig,
     Policy,
     Sampler,
-    check_fields,
-    few_weights,
     mlp,
-    whole,
 )
-from zest_rl.embedders import Precision
+from zest_rl.agents.configs import TREXConfig as TREXConfig
 from zest_rl.errors import BadInput
-from zest_rl.rewards.learned import Inputs
 from zest_rl.types import Episode
 
 N_JUDGED = 256
 """Held-out pairs."""
-
-# ---------------------------------------------------------------------------------------------------------- config
-
-
-@dataclass(frozen=True)
-class TREXConfig(OptimizerConfig):
-    """A reward from ranked trajectories (T-REX)."""
-
-    inputs: Inputs = "obs"
-    """The reward is a function of the observation, or of the scorer's embedding of the frame, mean of its views."""
-    snippet_len: int = 50
-    """Steps of the compared parts, drawn from the whole trajectory; at most those of the shortest trajectory."""
-    held_out: float = 0.2
-    """Share of the trajectories, evenly over the ranks, that is not trained on: the weights that agree best with its
-    ranking are kept. 0 trains on all and keeps the last weights."""
-    hidden_size: int = 64
-    """Units per hidden layer."""
-    n_layers: int = 0
-    """Hidden layers; 0: a linear reward."""
-    dropout: float = 0.0
-    """Share of hidden units that is zeroed while training."""
-    batch_size: int = 16
-    """Pairs per update."""
-    learning_rate: float = 3e-3
-    """AdamW's step size after warm-up."""
-    weight_decay: float = 10.0
-    """AdamW's decoupled weight decay."""
-    amp: Precision = "fp32"
-    """Precision of matrix products; auto is bf16 where the hardware has it."""
-    n_networks: int = 3
-    """Networks that are trained on the same pairs from different initial weights; the mean of their rewards counts."""
-
-    def __post_init__(self) -> None:
-        check_fields("T-REX config", self, {
-            "inputs": (self.inputs in get_args(Inputs), f"one of {', '.join(get_args(Inputs))}"),
-            "snippet_len": whole(self.snippet_len, 10**6),
-            "held_out": (0 <= self.held_out < 1, "in [0, 1)"),
-            "hidden_size": whole(self.hidden_size, LARGEST_WIDTH),
-            "n_layers": few_weights(self.n_layers + 1, self.hidden_size**2, self.n_networks),
-            "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
-            "batch_size": whole(self.batch_size, LARGEST_BATCH),
-            **self.optimizer_rules(),
-        })  # fmt: skip
-
 
 # ----------------------------------------------------------------------------------------------------------- model
 

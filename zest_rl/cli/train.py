@@ -26,12 +26,12 @@ class Arguments:
 
 
 def __getattr__(name: str) -> Any:
-    """Build ``CONFIGS`` when asked for: the registry imports torch."""
+    """Build ``CONFIGS`` when asked for."""
     if name != "CONFIGS":
         raise AttributeError(name)
-    from zest_rl.agents import AGENTS
+    from zest_rl.agents.configs import CONFIGS
 
-    return {agent: _with_arguments(agent, entry.config) for agent, entry in AGENTS.items()}
+    return {agent: _with_arguments(agent, agent_class) for agent, agent_class in CONFIGS.items()}
 
 
 def _with_arguments(agent: str, agent_class: type[Any]) -> type[Any]:
@@ -43,9 +43,9 @@ def _with_arguments(agent: str, agent_class: type[Any]) -> type[Any]:
 
 def split_config(config: Any) -> tuple[Any, Any]:
     """Return the agent's config and that of the training that flags stand for; both check their values."""
-    from zest_rl.agents import AGENTS
+    from zest_rl.agents.configs import config_of
 
-    parts = AGENTS[config.agent].config, trainer(config.agent).config
+    parts = config_of(config.agent), trainer(config.agent).config
     agent_config, training = (part(**{f.name: getattr(config, f.name) for f in fields(part)}) for part in parts)
     return agent_config, training
 

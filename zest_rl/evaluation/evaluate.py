@@ -10,12 +10,13 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.agents import Policy, load_policy
+from zest_rl.agents.configs import CONFIGS
+from zest_rl.agents.recorded import RecordedPolicy, recorded_policy
 from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput, Notice, nearest
 from zest_rl.evaluation.environments import KITCHEN, MAX_HORIZON, RunEnvironment, find_environment
@@ -30,6 +31,9 @@ from zest_rl.runtime.parallel import cached_jobs, chunks, one_thread, read_parts
 from zest_rl.runtime.records import from_json, reading_record
 from zest_rl.simulation.videos import Video, ensure_videos
 from zest_rl.types import EpisodeResult
+
+if TYPE_CHECKING:
+    from zest_rl.agents import Policy
 
 EPISODES_PER_JOB, N_JOBS = 5, 10
 """An evaluation is split into `N_JOBS` parts of at least `EPISODES_PER_JOB` episodes: small enough that all cores have
@@ -142,7 +146,7 @@ class Evaluation:
         return summary
 
 
-def target_return(policy: Policy, config: EvaluationConfig) -> float | None:
+def target_return(policy: Policy | RecordedPolicy, config: EvaluationConfig) -> float | None:
     """Return the return that a policy is asked for, a quantile of its training returns; None if it uses no return."""
     if not policy.uses_return:
         return None
@@ -154,6 +158,8 @@ _Job = tuple[Path, EvaluationConfig, RunEnvironment, range, bool, str]
 
 
 def _evaluate_part(job: _Job) -> Traces:
+    from zest_rl.agents import load_policy
+
     run, config, environment, seeds, scored, device = job
     policy = load_policy(run, device=device)
     online = load_online(run, DatasetRecord.of_run(policy.meta)) if scored else {}
@@ -203,7 +209,7 @@ def evaluate(
     run = local_run(run)
     check_finished(run)
     run = run.resolve()
-    policy = load_policy(run, device=device, trust=trust)
+    policy = _policy(run, device, trust, is_done=(evaluation_folder(run, config) / "result.json").exists())
     dataset = DatasetRecord.of_run(policy.meta)
     environment = find_environment(policy.meta, env=config.env, horizon=config.horizon, success_key=config.success_key)
     scored = score or uses_online_scores(policy, config.rtg)
@@ -225,6 +231,15 @@ def evaluate(
         if videos:
             ensure_videos(episode_videos(result).values(), n_workers=n_workers)
     return result
+
+
+def _policy(run: Path, device: str, trust: bool, *, is_done: bool) -> Policy | RecordedPolicy:
+    """Return a policy; to see that nothing is to be done takes no torch, which is imported when a policy acts."""
+    if is_done and artifacts.read_json(run / "meta.json").get("agent") in CONFIGS:
+        return recorded_policy(run)
+    from zest_rl.agents import load_policy
+
+    return load_policy(run, device=device, trust=trust)
 
 
 def _jobs(

@@ -7,13 +7,13 @@ that was trained on them gets them.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.agents import Policy
+from zest_rl.agents.recorded import RecordedPolicy
 from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.evaluation.environments import RunEnvironment, act_in, find_environment
@@ -21,12 +21,15 @@ from zest_rl.rewards.learned import LearnedReward
 from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.types import FloatArray
 
+if TYPE_CHECKING:
+    from zest_rl.agents import Policy
+
 Rtg = Literal["online", "constant", "schedule"]
 """How the return-to-go falls: by the online ZeST score, not at all, or as in the best training episode."""
 Traces = dict[str, NDArray[Any]]
 
 
-def uses_online_scores(policy: Policy, rtg: Rtg) -> bool:
+def uses_online_scores(policy: Policy | RecordedPolicy, rtg: Rtg) -> bool:
     """Whether each new state must be scored while the policy acts."""
     return policy.uses_return and rtg == "online" and not _record(policy).has_recorded_rewards
 
@@ -118,7 +121,7 @@ def run_episodes(
     return arrays if environment.is_kitchen else arrays | {"n_steps": n_steps}
 
 
-def _record(policy: Policy) -> DatasetRecord:
+def _record(policy: Policy | RecordedPolicy) -> DatasetRecord:
     return DatasetRecord.of_run(policy.meta)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -14,6 +15,8 @@ Values = NDArray[np.float64]
 Statistic = Callable[[Values], Values]
 N_RESAMPLES, BLOCK = 10_000, 200
 """Bootstrap samples, and how many are in memory at a time."""
+Z_95 = 1.959963984540054
+"""The 97.5 % quantile of the normal distribution."""
 MIN_EPISODES_TO_RANK = 3
 """With fewer, a rank correlation means nothing."""
 
@@ -49,9 +52,10 @@ def mean(values: Values) -> Values:
 
 def iqm(values: Values) -> Values:
     """Interquartile mean over the last axis: the mean of the middle half (Agarwal et al. 2021)."""
-    from scipy import stats  # here, as it takes most of a second to import
-
-    return np.asarray(stats.trim_mean(values, 0.25, axis=-1))
+    values = np.asarray(values)
+    n_cut = values.shape[-1] // 4
+    middle = np.partition(values, (n_cut, values.shape[-1] - n_cut - 1), axis=-1)[..., n_cut : values.shape[-1] - n_cut]
+    return np.asarray(middle.mean(axis=-1))
 
 
 def bootstrap(
@@ -140,19 +144,19 @@ def spearman(a: Values, b: Values, *, seed: int = 0, n_resamples: int = 1000) ->
     def rho(i: NDArray[np.intp]) -> float:
         if np.ptp(a[i]) == 0 or np.ptp(b[i]) == 0:
             return float("nan")
-        return float(stats.spearmanr(a[i], b[i]).statistic)
+        return float(np.corrcoef(stats.rankdata(a[i]), stats.rankdata(b[i]))[1, 0])
 
     return over_episodes(rho, len(a), seed=seed, n_resamples=n_resamples)
 
 
 def wilson(n_successes: int, n: int) -> Estimate:
     """Success rate with the 95 % Wilson score interval."""
-    from scipy import stats
-
     if n < 1:
         raise BadInput("a success rate needs at least 1 episode")
-    interval = stats.binomtest(n_successes, n).proportion_ci(method="wilson")
-    return Estimate(n_successes / n, float(interval.low), float(interval.high))
+    rate, z2 = n_successes / n, Z_95**2
+    centre, scale = (2 * n * rate + z2) / (2 * (n + z2)), Z_95 / (2 * (n + z2))
+    half = scale * math.sqrt(4 * n * rate * (1 - rate) + z2)
+    return Estimate(rate, centre - half if n_successes else 0.0, centre + half if n_successes < n else 1.0)
 
 
 def representative(returns: Values) -> dict[str, int]:

@@ -14,7 +14,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import nn
 
-from zest_rl.agents.online import NormalizedReLU, OnlineConfig, OnPolicyConfig, SACConfig, TRPOConfig
+from zest_rl.agents.configs import OnlineConfig, OnPolicyConfig, SACConfig, TRPOConfig
+from zest_rl.agents.online import NormalizedReLU
 
 EXPLORED = 1000
 """Random steps before SAC learns from scratch."""

@@ -17,7 +17,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from zest_rl.agents import get_agent
 from zest_rl.agents.base import DataFacts
-from zest_rl.agents.online import CorrectedPolicy, OnlineConfig
+from zest_rl.agents.configs import OnlineConfig
+from zest_rl.agents.online import CorrectedPolicy
 from zest_rl.errors import ZestError
 from zest_rl.evaluation.environments import RunEnvironment
 from zest_rl.online.algorithms import build, mean_network
@@ -27,9 +28,8 @@ from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import read_arrays, write_arrays
 from zest_rl.runtime.learner_state import restore, state_of
 from zest_rl.runtime.records import reading_record
-from zest_rl.training.checkpoints import snapshot_folder
 from zest_rl.training.log import MetricsLog
-from zest_rl.training.loop import OnProgress, RunConfig
+from zest_rl.training.request import OnProgress, RunConfig, snapshot_folder
 from zest_rl.types import Episode
 
 CHECKPOINT = "checkpoint.npz"

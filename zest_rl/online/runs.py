@@ -23,7 +23,8 @@ import torch
 
 from zest_rl.agents import get_agent
 from zest_rl.agents.base import describe_data
-from zest_rl.agents.online import START, OnlineAgent, OnlineConfig
+from zest_rl.agents.configs import START, OnlineConfig
+from zest_rl.agents.online import OnlineAgent
 from zest_rl.data.folders import CARD_FILE
 from zest_rl.data.reader import Dataset, open_dataset
 from zest_rl.errors import BadInput
@@ -31,7 +32,8 @@ from zest_rl.evaluation.environments import find_environment
 from zest_rl.online.rewards import OnlineReward, learned_reward, own_reward
 from zest_rl.rewards.cards import policy_card
 from zest_rl.runtime import artifacts
-from zest_rl.training.loop import OnProgress, RunConfig, TrainingConfig, check_request, torch_set_up, training_device
+from zest_rl.training.loop import torch_set_up, training_device
+from zest_rl.training.request import OnProgress, RunConfig, TrainingConfig, check_request
 from zest_rl.training.runs import default_run_dir, scorer_files
 from zest_rl.training.runs import train as train_on_data
 from zest_rl.types import Episode

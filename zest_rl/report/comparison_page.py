@@ -40,7 +40,7 @@ from zest_rl.rewards.state_scorer import StateScorer
 from zest_rl.runtime.files import check_file
 from zest_rl.runtime.records import reading_record
 from zest_rl.simulation.videos import Film, ensure_video
-from zest_rl.training.checkpoints import snapshots
+from zest_rl.training.request import snapshots
 
 
 def method_row(method: Method, *tasks: Sequence[Evaluation]) -> MethodRow:

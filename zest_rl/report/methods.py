@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from zest_rl.agents.foreign import FOREIGN
+from zest_rl.agents.configs import FOREIGN
 from zest_rl.analysis.inspection import names_with_settings
 from zest_rl.data.provenance import DatasetRecord, RelabelRecord
 from zest_rl.errors import BadInput

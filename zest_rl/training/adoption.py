@@ -20,6 +20,7 @@ import torch
 
 from zest_rl.agents import foreign
 from zest_rl.agents.base import describe_data
+from zest_rl.agents.configs import FOREIGN
 from zest_rl.data.folders import CARD_FILE
 from zest_rl.data.reader import open_dataset
 from zest_rl.errors import BadInput
@@ -79,7 +80,7 @@ def adopt(
         on_start(run_dir)
     facts = describe_data(episodes)
     request: dict[str, Any] = {
-        "agent": foreign.FOREIGN,
+        "agent": FOREIGN,
         "name": name,
         "config": {},
         "n_updates": None,

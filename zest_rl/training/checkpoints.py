@@ -120,16 +120,6 @@ def _checkpoints(run_dir: Path) -> list[Path]:
     return sorted((run_dir / "checkpoints").glob("update-*"))
 
 
-def snapshot_folder(run_dir: Path, update: int) -> Path:
-    """Return the folder of the policy after `update` updates, whether or not it is kept."""
-    return run_dir / "snapshots" / f"update-{update:09d}"
-
-
-def snapshots(run_dir: Path) -> list[Path]:
-    """Return the folders of the policies that a training kept along the way, the earliest first."""
-    return sorted((run_dir / "snapshots").glob("update-*"))
-
-
 def resume(run_dir: Path, state: TrainState) -> None:
     """Restore `state` and torch's generators from the newest checkpoint, if there is one.
 

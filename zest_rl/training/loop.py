@@ -19,16 +19,15 @@ Under ``torchrun`` the processes share the work (`zest_rl.training.distributed`)
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import safetensors.torch
@@ -39,72 +38,22 @@ from zest_rl.agents import get_agent
 from zest_rl.agents.base import (
     JUDGED,
     Agent,
-    OptimizerConfig,
-    Rules,
     autocast,
-    check_fields,
     describe_data,
     networks_of,
     resolve_precision,
 )
+from zest_rl.agents.configs import OptimizerConfig
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.runtime import artifacts
-from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint, snapshot_folder
+from zest_rl.training.checkpoints import TrainState, resume, save_checkpoint
 from zest_rl.training.distributed import Group, launched, local_index, process_group
 from zest_rl.training.log import COLUMNS, MetricsLog
+from zest_rl.training.request import OnProgress, asked, check_request, snapshot_folder
+from zest_rl.training.request import TrainingConfig as TrainingConfig
 from zest_rl.types import Episode
 
 RESULT_KEYS = ("n_params", "model_sha256", "train_seconds", "made_by")  # keys of meta.json that are known at the end
-
-
-@dataclass(frozen=True)
-class RunConfig:
-    """Where a policy is trained, and what of it is kept."""
-
-    seed: int = 0
-    """Of weights, batches and dropout."""
-    device: str = "auto"
-    """auto (CUDA where there is a GPU), cpu, cuda, cuda:1, …"""
-    threads: int | None = None
-    """CPU threads; default torch's own. The last digits of the result depend on it."""
-    checkpoint_every: int = 500
-    """Updates, or steps in the environment, between checkpoints, from which an interrupted run goes on."""
-    log_every: int = 50
-    """Updates, or steps, between log rows (metrics.csv, TensorBoard), which hold means over these updates."""
-    snapshot_every: int | None = None
-    """Updates, or steps, between policies kept in RUN/snapshots, which `zest evaluate` takes too; default none."""
-
-    def __post_init__(self) -> None:
-        check_fields("training", self, self.rules())
-
-    def rules(self) -> Rules:
-        """Return the rules of the fields."""
-        return {
-            "seed": (self.seed >= 0, "0 or positive"),
-            "threads": (self.threads is None or self.threads >= 1, "at least 1, or None"),
-            "checkpoint_every": (self.checkpoint_every >= 1, "at least 1"),
-            "log_every": (self.log_every >= 1, "at least 1"),
-            "snapshot_every": (self.snapshot_every is None or self.snapshot_every >= 1, "at least 1, or None"),
-        }
-
-
-@dataclass(frozen=True)
-class TrainingConfig(RunConfig):
-    """How long and where a policy is trained on a dataset; each algorithm has its own config besides."""
-
-    n_updates: int = 5000
-    """Gradient steps."""
-
-    def rules(self) -> Rules:
-        """Return the rules of the fields."""
-        return {**super().rules(), "n_updates": (self.n_updates >= 1, "at least 1")}
-
-
-class OnProgress(Protocol):
-    """Called after every logged row."""
-
-    def __call__(self, n: int, **fields: float) -> None:
-        """Take the number of updates since the last call (at first, since update 0), and the row by `COLUMNS`."""
 
 
 def fit(
@@ -148,17 +97,10 @@ def fit(
     judge = definition.judge(agent_config, facts, episodes)
     launched().share(sample(np.random.default_rng(config.seed)))  # a batch that is too small is refused first
     precision = resolve_precision(agent_config.amp, device)
-    request: dict[str, Any] = {
-        "agent": agent,
-        "config": asdict(agent_config),
-        "n_updates": config.n_updates,
-        "seed": config.seed,
-        "device": str(device),
-        "threads": torch.get_num_threads() if config.threads is None else config.threads,
-        "snapshot_every": config.snapshot_every,
-        "precision": precision,
-        "data_sha256": artifacts.hash_arrays(*(a for e in episodes for a in (e.obs, e.actions, e.rewards))),
-    }
+    request = asked(agent, agent_config, episodes, config)
+    request |= {"device": str(device), "precision": precision}
+    if config.threads is None:
+        request["threads"] = torch.get_num_threads()
     if launched().size > 1:
         request["n_processes"] = launched().size
     clashing = sorted(meta.keys() & {*request, *asdict(facts), *RESULT_KEYS, "held_out"})
@@ -322,40 +264,6 @@ def _claimed(run_dir: Path, request: dict[str, Any], group: Group) -> Iterator[b
         if group.leads:
             shutil.rmtree(run_dir / "checkpoints", ignore_errors=True)
         group.agree()
-
-
-def check_request(run_dir: Path, request: dict[str, Any]) -> None:
-    """Write ``run.json``, or check that the existing one holds the same arguments.
-
-    Raises:
-        BadInput: it holds others, or the folder other files.
-    """
-    path = run_dir / "run.json"
-    if path.exists():
-        defaults = _flat({"config": asdict(get_agent(request["agent"]).config())})  # of options newer than the run
-        before, now = defaults | _flat(artifacts.read_json(path)), _flat(json.loads(json.dumps(request)))
-        differing = [
-            f"{key} (was {before.get(key)!r}, is {now.get(key)!r})"
-            for key in sorted(before.keys() | now.keys())
-            if before.get(key) != now.get(key)
-        ]
-        if differing:
-            raise BadInput(
-                f"{run_dir} holds a run with other arguments: {'; '.join(differing)}; repeat the arguments of that "
-                "run, or give another --run-dir"
-            )
-    elif run_dir.exists() and any(not entry.name.startswith(".") for entry in run_dir.iterdir()):
-        raise BadInput(f"{run_dir} is not empty and holds no run; give another --run-dir")
-    else:
-        artifacts.write_json(path, request)
-
-
-def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested objects as one, with dotted keys."""
-    items: dict[str, Any] = {}
-    for key, entry in value.items():
-        items |= _flat(entry, f"{prefix}{key}.") if isinstance(entry, dict) else {f"{prefix}{key}": entry}
-    return items
 
 
 def _write_snapshot(run_dir: Path, state: TrainState, described: dict[str, Any], files: Mapping[str, bytes]) -> None:

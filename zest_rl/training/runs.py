@@ -7,17 +7,14 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from zest_rl.agents import get_agent
+from zest_rl.agents.configs import config_of
 from zest_rl.data.folders import CARD_FILE
 from zest_rl.data.reader import Dataset, open_dataset
-from zest_rl.rewards.by_learned import embeddings_of
 from zest_rl.rewards.cards import policy_card
-from zest_rl.rewards.scorer import SCORER_FILE
 from zest_rl.runtime import artifacts
-from zest_rl.runtime.hub import REWARD_FILES
-from zest_rl.training.checkpoints import snapshots
+from zest_rl.runtime.hub import REWARD_FILES, SCORER_FILE
 from zest_rl.training.distributed import launched
-from zest_rl.training.loop import OnProgress, TrainingConfig, fit
+from zest_rl.training.request import OnProgress, TrainingConfig, asked, is_finished, snapshots
 
 
 def train(
@@ -50,12 +47,17 @@ def train(
     config = TrainingConfig() if config is None else config
     with open_dataset(dataset_id) as dataset:
         episodes, meta, files = dataset.episodes(), {"dataset": dataset.describe()}, scorer_files(dataset)
-        agent_config = get_agent(agent).config() if agent_config is None else agent_config
+        agent_config = config_of(agent)() if agent_config is None else agent_config
         if getattr(agent_config, "inputs", "obs") == "embeddings":
+            from zest_rl.rewards.by_learned import embeddings_of
+
             embeddings = embeddings_of(dataset, dataset.path / SCORER_FILE, device=config.device)
             episodes = [replace(e, obs=seen.mean(axis=1)) for e, seen in zip(episodes, embeddings, strict=True)]
     run_dir = run_dir or default_run_dir(agent, dataset_id, config.seed)
-    fit(agent, agent_config, episodes, run_dir, config, meta=meta, files=files, on_progress=on_progress)
+    if launched().size > 1 or not is_finished(run_dir, asked(agent, agent_config, episodes, config) | meta):
+        from zest_rl.training.loop import fit  # imports torch, which takes longer than all else for a finished run
+
+        fit(agent, agent_config, episodes, run_dir, config, meta=meta, files=files, on_progress=on_progress)
     if launched().leads:
         for folder, (name, content) in product((run_dir, *snapshots(run_dir)), files.items()):
             if not (folder / name).exists():  # earlier versions wrote it when all else was there

@@ -159,7 +159,7 @@ def run_cells(
 def _is_done(cell: Cell, folder: Path) -> bool:
     """Whether a cell's results are there; a marker without them is removed, so that the cell is run again."""
     from zest_rl.evaluation.evaluate import evaluation_folder
-    from zest_rl.training.checkpoints import snapshots
+    from zest_rl.training.request import snapshots
 
     marker = folder / f"{cell.name}.npz"
     policies = (cell.run, *snapshots(cell.run))
@@ -172,13 +172,13 @@ def _is_done(cell: Cell, folder: Path) -> bool:
 def _train_and_evaluate(cell: Cell) -> dict[str, NDArray[np.float64]]:
     import numpy as np
 
-    from zest_rl.agents.foreign import FOREIGN
+    from zest_rl.agents.configs import FOREIGN
     from zest_rl.api import trainer
     from zest_rl.cli.evaluate import Config as EvaluateFlags
     from zest_rl.cli.train import split_config
     from zest_rl.evaluation.evaluate import evaluate, evaluation_folder
     from zest_rl.training.adoption import adopt
-    from zest_rl.training.checkpoints import snapshots
+    from zest_rl.training.request import snapshots
 
     training_code, evaluation_code = cell.code_records
     if not (cell.run / "meta.json").exists():

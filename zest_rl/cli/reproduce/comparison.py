@@ -90,7 +90,7 @@ class MethodTable:
     @property
     def agent_or_foreign(self) -> str:
         """The agent, or ``foreign`` for a policy that was trained elsewhere."""
-        from zest_rl.agents.foreign import FOREIGN
+        from zest_rl.agents.configs import FOREIGN
 
         return self.agent or FOREIGN
 
@@ -171,7 +171,7 @@ def _read_goals(tables: ComparisonTables, task: Any, recipe: str) -> dict[str, A
 
 def run_config(agent: str) -> type[Any]:
     """Return the config of the verb that makes the run: `zest train AGENT`, or `zest adopt` for ``foreign``."""
-    from zest_rl.agents.foreign import FOREIGN
+    from zest_rl.agents.configs import FOREIGN
     from zest_rl.cli import adopt, train
 
     config: type[Any] = adopt.Config if agent == FOREIGN else train.CONFIGS[agent]
@@ -179,7 +179,7 @@ def run_config(agent: str) -> type[Any]:
 
 
 def _read_method(tables: ComparisonTables, method: Mapping[str, Any], where: str) -> MethodArguments:
-    from zest_rl.agents import AGENTS, get_agent
+    from zest_rl.agents.configs import CONFIGS, config_of
     from zest_rl.cli import evaluate
 
     keys = {key: value for key, value in method.items() if key in (f.name for f in fields(MethodTable))}
@@ -187,7 +187,7 @@ def _read_method(tables: ComparisonTables, method: Mapping[str, Any], where: str
     table = load_config(MethodTable, keys, where)
     if table.agent is not None:
         with located(where):
-            get_agent(table.agent)
+            config_of(table.agent)
     if table.goal is not None and table.goal not in tables.goals:
         raise BadInput(f"{where}: unknown goal {table.goal!r}; {nearest(table.goal, tables.goals)}")
     seeds = tables.seeds if table.seeds is None else table.seeds
@@ -198,7 +198,7 @@ def _read_method(tables: ComparisonTables, method: Mapping[str, Any], where: str
         _check_policy(tables, seeds, table.policy, flags.get("python"), where)
         train = {"policy": table.policy, **checked_table(flags, where, "dataset", "seed", "run_dir", "name")}
     else:
-        by_agent = {key: value for key, value in tables.train.items() if key in AGENTS and isinstance(value, dict)}
+        by_agent = {key: value for key, value in tables.train.items() if key in CONFIGS and isinstance(value, dict)}
         shared = {key: value for key, value in tables.train.items() if key not in by_agent}
         train = {"threads": 1, "device": "cpu"}
         if "n_updates" in arguments_of(run_config(table.agent_or_foreign)):
