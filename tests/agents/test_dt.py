@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,8 @@ import torch
 from transformers import DecisionTransformerConfig, DecisionTransformerModel
 
 from zest_rl.agents import dt, load_policy
-from zest_rl.agents.base import Policy, describe_data, returns_to_go
+from zest_rl.agents.base import Policy, autocast, describe_data, ready_to_act, returns_to_go
+from zest_rl.embedders import Precision
 from zest_rl.errors import BadInput
 from zest_rl.training.loop import TrainingConfig, fit
 from zest_rl.types import Episode, FloatArray
@@ -57,6 +59,24 @@ def test_asked_for_a_high_or_a_low_return_it_chooses_the_behaviour_that_earned_i
     high, low = policy.meta["return_quantiles"][-1], policy.meta["return_quantiles"][0]
     np.testing.assert_allclose(play(policy, high, reward=1.0), 0.6, atol=0.15)
     np.testing.assert_allclose(play(policy, low, reward=0.1), -0.6, atol=0.15)
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize(("length", "n_heads"), [(1, 1), (4, 2)])
+def test_it_acts_by_the_operations_of_transformers_to_the_bit(precision: Precision, length: int, n_heads: int) -> None:
+    facts = describe_data(two_behaviours())
+    model = dt.build_model(replace(SMALL, n_heads=n_heads), facts).eval()
+    rng = np.random.default_rng(0)
+    batch = {
+        "obs": torch.from_numpy(rng.normal(size=(5, length, 3)).astype(np.float32)),
+        "actions": torch.from_numpy(rng.uniform(-1, 1, (5, length, 2)).astype(np.float32)),
+        "rtg": torch.from_numpy(rng.uniform(size=(5, length, 1)).astype(np.float32)),
+        "timesteps": torch.arange(length).expand(5, length),
+    }
+    ready = ready_to_act(copy.deepcopy(model), precision)
+    with torch.no_grad(), autocast(precision, torch.device("cpu")):
+        expected = dt.predict_actions(model, batch | {"valid": torch.ones(5, length, dtype=torch.bool)})
+        assert torch.equal(dt.acted(ready, batch), expected)
 
 
 def test_without_conditioning_the_target_return_changes_nothing(tmp_path: Path) -> None:

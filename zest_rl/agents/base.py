@@ -188,9 +188,24 @@ def networks_of(model: nn.Module) -> list[nn.Module]:
     return list(model) if isinstance(model, nn.ModuleList) else [model]
 
 
+def ready_to_act(model: nn.Module, precision: Precision) -> nn.Module:
+    """Return a trained model, in eval mode, without what acting does not need; its outputs stay equal to the bit.
+
+    In bf16 `autocast` casts the weights of every product anew in each step, which takes longer than the product.
+    """
+    for module in list(model.modules()):
+        for name, child in module.named_children():
+            if isinstance(child, nn.Dropout):
+                setattr(module, name, nn.Identity())
+            elif precision == "bf16" and (isinstance(child, nn.Linear) or type(child).__name__ == "Conv1D"):
+                child.bfloat16()
+    return model
+
+
 def mean_action(predict: Callable[[nn.Module, T], Tensor], model: nn.Module, batch: T) -> Tensor:
     """Return the mean of ``predict(network, batch)``, actions of any shape, over the networks of `Agent.networks`."""
-    return torch.stack([predict(network, batch) for network in networks_of(model)]).mean(dim=0)
+    actions = [predict(network, batch) for network in networks_of(model)]
+    return actions[0] if len(actions) == 1 else torch.stack(actions).mean(dim=0)
 
 
 class Policy(Protocol):

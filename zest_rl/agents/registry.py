@@ -10,7 +10,7 @@ import safetensors.torch
 import torch
 
 from zest_rl.agents import bc, dt, foreign, online, rvs, trex
-from zest_rl.agents.base import Agent, DataFacts, Policy
+from zest_rl.agents.base import Agent, DataFacts, Policy, ready_to_act
 from zest_rl.agents.configs import FOREIGN, config_of
 from zest_rl.agents.recorded import recorded_policy
 from zest_rl.embedders import find_device
@@ -75,6 +75,6 @@ def _load(run_dir: Path, device: torch.device) -> Policy:
             raise ValueError("its config is not that of model.safetensors")
         model = agent.networks(config, facts)
         model.load_state_dict(tensors)
-    model = model.to(device).eval()
+    model = ready_to_act(model.to(device).eval(), meta["precision"])
     with reading_record(run_dir / "meta.json"):
         return agent.policy(model, config, facts, meta, device)

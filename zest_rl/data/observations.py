@@ -154,8 +154,11 @@ def by_path(values: Any, prefix: str = "") -> dict[str, Any]:
     """Return the entries of nested dictionaries by their keys with ``/`` between them."""
     if not isinstance(values, Mapping):
         return {prefix: values}
-    parts = (by_path(part, f"{prefix}/{name}".lstrip("/")) for name, part in values.items())
-    return {path: value for part in parts for path, value in part.items()}
+    found: dict[str, Any] = {}
+    for name, part in values.items():
+        path = f"{prefix}/{name}" if prefix else str(name).lstrip("/")
+        found |= by_path(part, path) if isinstance(part, Mapping) else {path: part}
+    return found
 
 
 def observed(observations: Sequence[Any]) -> dict[str, NDArray[Any]]:

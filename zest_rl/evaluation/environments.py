@@ -93,8 +93,9 @@ class RunEnvironment:
 
         `reward` is None at the reset, at which only the kitchen tells one.
         """
-        at_reset = (by_path(info).get("gt/reward") or 0.0) if self.is_kitchen else 0.0
-        told: dict[str, NDArray[Any]] = {"gt_reward": np.asarray(at_reset if reward is None else reward, np.float32)}
+        if reward is None:
+            reward = (by_path(info).get("gt/reward") or 0.0) if self.is_kitchen else 0.0
+        told: dict[str, NDArray[Any]] = {"gt_reward": np.asarray(reward, np.float32)}
         if self.success_key is not None:
             value = by_path(info).get(self.success_key)
             told["gt_success"] = np.array(value is not None and bool(np.any(value)))
@@ -109,7 +110,7 @@ def act_in(env: gymnasium.Env[Any, Any], action: FloatArray) -> Any:
     """Return an action (act_dim,) of a policy in the form and the bounds of the environment's space."""
     space = env.action_space
     assert isinstance(space, gymnasium.spaces.Box)
-    return np.clip(action.reshape(space.shape), space.low, space.high).astype(space.dtype)
+    return np.minimum(np.maximum(action.reshape(space.shape), space.low), space.high).astype(space.dtype)
 
 
 def find_environment(
