@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from zest_rl.analysis.learned_rewards import judge_learned_reward
+from zest_rl.cli.reproduce.reward_study import figures, read_reward_study
 from zest_rl.cli.reproduce.study import read_study
 from zest_rl.cli.reproduce.study_tables import as_markdown, mean_over_tasks
 from zest_rl.errors import BadInput
+from zest_rl.kitchen import calibration
 
 RECIPE = """
 study = "goals"
@@ -48,11 +52,13 @@ def write(folder: Path, text: str = RECIPE) -> Path:
 
 @pytest.fixture(scope="module")
 def _data(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """One Minari root and cache for all studies here: the first of them collects and embeds."""
+    """One Minari root and cache for all studies here: the first collects and embeds. Few starts judge the expert."""
     root = tmp_path_factory.mktemp("data")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MINARI_DATASETS_PATH", str(root / "minari"))
         patch.setenv("ZEST_CACHE", str(root / "cache"))
+        patch.setattr(calibration, "N_REFERENCE", 2)
+        patch.setattr(calibration, "N_NOTHING", 1)
         yield
 
 
@@ -165,3 +171,94 @@ def test_a_wrong_study_is_refused_before_anything_runs(tmp_path: Path, old: str,
     assert old in RECIPE
     with pytest.raises(BadInput, match=message):
         read_study(write(tmp_path, RECIPE.replace(old, new)))
+
+
+LEARNED = """
+study = "trex"
+title = "A tiny study of rewards"
+caveats = ["Tiny."]
+
+[collect]
+task = "micro"
+n_episodes = 4
+noise_max = 1.0
+dataset = "zest/kitchen-micro-whole-v0"
+
+[relabel]
+goal = "same-scene"
+views = 1
+tolerance = 0.05
+
+[rankings."Cos+Delta"]
+[rankings."shuffled"]
+shuffle = 0
+
+[train]
+n_updates = 10
+hidden_size = 8
+snippet_len = 10
+threads = 1
+device = "cpu"
+
+[inputs.obs]
+[inputs.embeddings]
+
+[paper."ResNet, raw Cos"]
+micro = 84.88
+"""
+
+
+@pytest.mark.usefixtures("_data")
+def test_a_study_learns_rewards_from_every_ranking_and_judges_them_beside_the_plain_sums(
+    tmp_path: Path, zest: Callable[..., dict[str, Any]]
+) -> None:
+    words = ("reproduce", write(tmp_path, LEARNED), "--output", tmp_path / "out", "--n-workers", "1")
+    result = zest(*words)
+    rows = {(row["ranking"], row["inputs"]): row["tasks"]["micro"] for row in result["rows"]}
+    assert list(rows) == [(r, i) for r in ("Cos+Delta", "shuffled") for i in ("obs", "embeddings")]
+    assert all(0 <= row["accuracy"] <= 1 for row in rows.values())
+    assert rows["Cos+Delta", "obs"]["plain"] == rows["Cos+Delta", "embeddings"]["plain"], (
+        "both learned from these scores"
+    )
+
+    best = result["returns"]
+    judged = judge_learned_reward(next(run for run in (tmp_path / "out" / "runs").iterdir() if is_of(run, best)))
+    assert figures(judged) == rows[best["ranking"], best["inputs"]]
+    assert best["tasks"]["micro"]["held_out"] == np.flatnonzero(judged.held_out).tolist()
+    np.testing.assert_allclose(best["tasks"]["micro"]["learned"], judged.learned_returns, atol=0.005)
+    np.testing.assert_allclose(best["tasks"]["micro"]["true"], judged.true_returns, atol=0.005)
+
+    table = (tmp_path / "out" / "table.md").read_text()
+    assert f"| T-REX of obs, ranked by shuffled | {100 * rows['shuffled', 'obs']['accuracy']:.1f} |" in table
+    assert f"| plain sum of Cos+Delta | {100 * rows['Cos+Delta', 'obs']['plain']:.1f} |" in table
+    assert "| paper: ResNet, raw Cos | 84.9 | 84.9 |" in table
+    html = (tmp_path / "out" / "report.html").read_text()
+    assert all(f"micro: {i}, {r}, {w}" in html for r, i in rows for w in ("seen", "unseen"))
+    written = {run: (run / "meta.json").stat().st_mtime_ns for run in (tmp_path / "out" / "runs").iterdir()}
+    assert zest(*words)["rows"] == result["rows"]
+    assert written == {run: (run / "meta.json").stat().st_mtime_ns for run in written}, "finished runs are found again"
+
+
+def is_of(run: Path, row: dict[str, Any]) -> bool:
+    """Whether a run is that of a row."""
+    meta = json.loads((run / "meta.json").read_text())
+    is_shuffled = meta["dataset"]["zest"]["relabel"]["shuffle"] is not None
+    return (meta["config"]["inputs"], is_shuffled) == (row["inputs"], row["ranking"] == "shuffled")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("shuffle = 0", "shufle = 0", "unknown key 'shufle'; did you mean 'shuffle'"),
+        ("[inputs.obs]", "[inputs.pixels]", "inputs"),
+        ("[inputs.obs]", '[inputs.obs]\nrun_dir = "here"', "'run_dir' is not for a recipe to set"),
+        ("shuffle = 0", 'dataset = "a/b-v0"', "[rankings.'shuffled']: 'dataset' is not for a recipe to set"),
+        ("snippet_len = 10", "snippet_len = 0", "snippet_len must be 1 to"),
+    ],
+)
+def test_a_wrong_study_of_rewards_is_refused_before_anything_runs(
+    old: str, new: str, complaint: str, tmp_path: Path
+) -> None:
+    assert LEARNED.count(old) == 1
+    with pytest.raises(BadInput, match=re.escape(complaint)):
+        read_reward_study(write(tmp_path, LEARNED.replace(old, new)))

@@ -16,7 +16,7 @@ from zest_rl.agents.trex import TREXConfig, split
 from zest_rl.data.reader import open_dataset
 from zest_rl.errors import BadInput
 from zest_rl.metrics.part_ranking import part_accuracy
-from zest_rl.metrics.statistics import spearman
+from zest_rl.metrics.statistics import MIN_EPISODES_TO_RANK, spearman
 from zest_rl.rewards.by_learned import embeddings_of
 from zest_rl.rewards.learned import LearnedReward
 from zest_rl.rewards.scorer import SCORER_FILE
@@ -33,7 +33,7 @@ class Judgement:
     plain: float
     """The same of the dataset's own rewards, which ranked the trajectories: a learned reward must beat it."""
     rho_seen: float
-    """Rank correlation of learned and true returns, over the trajectories that were trained on."""
+    """Rank correlation of learned and true returns, over the trajectories that were trained on; NaN of too few."""
     rho_unseen: float
     """Over those held out."""
     learned_returns: NDArray[np.float64]
@@ -71,12 +71,16 @@ def judge_learned_reward(run: Path) -> Judgement:
     return Judgement(
         on_unseen(learned),
         on_unseen([episode.rewards for episode in episodes]),
-        spearman(learned_returns[~held_out], true_returns[~held_out]).value,
-        spearman(learned_returns[held_out], true_returns[held_out]).value,
+        _rank_correlation(learned_returns[~held_out], true_returns[~held_out]),
+        _rank_correlation(learned_returns[held_out], true_returns[held_out]),
         learned_returns,
         true_returns,
         held_out,
     )
+
+
+def _rank_correlation(learned: NDArray[np.float64], true: NDArray[np.float64]) -> float:
+    return spearman(learned, true).value if len(true) >= MIN_EPISODES_TO_RANK else np.nan
 
 
 def _returns(rewards: Sequence[FloatArray]) -> NDArray[np.float64]:

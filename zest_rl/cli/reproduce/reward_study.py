@@ -175,15 +175,19 @@ def as_markdown(result: Mapping[str, Any]) -> str:
     head = f"| | {' | '.join(tasks)} | mean |\n|---|{'---|' * (len(tasks) + 1)}\n"
     table = "Parts of unseen trajectories ranked as by the ground truth, %\n\n" + head
     for name, values in lines(result):
-        known = [100 * value for value in values if value is not None]
-        cells = " | ".join("–" if value is None else f"{100 * value:.1f}" for value in values)
-        table += f"| {name} | {cells} | {sum(known) / len(known):.1f} |\n"
+        table += f"| {name} | {_cells([None if value is None else 100 * value for value in values], 1)} |\n"
     table += "\nRank correlation of learned and true returns of unseen trajectories\n\n" + head
     for row in result["rows"]:
-        rho = [row["tasks"][task]["rho_unseen"] or 0.0 for task in tasks]
-        cells = " | ".join(f"{value:.2f}" for value in rho)
-        table += f"| T-REX of {row['inputs']}, ranked by {row['ranking']} | {cells} | {sum(rho) / len(rho):.2f} |\n"
+        rho = [row["tasks"][task]["rho_unseen"] for task in tasks]
+        table += f"| T-REX of {row['inputs']}, ranked by {row['ranking']} | {_cells(rho, 2)} |\n"
     return table
+
+
+def _cells(values: list[float | None], digits: int) -> str:
+    """Write values, and their mean; a dash for what is not known."""
+    known = [value for value in values if value is not None]
+    mean = sum(known) / len(known) if known else None
+    return " | ".join("–" if value is None else f"{value:.{digits}f}" for value in (*values, mean))
 
 
 def reward_page(
