@@ -58,8 +58,10 @@ def main() -> None:
         except BadInput as error:
             parser.exit(2, f"error: {error}\n")
     as_json = ["--json"] if arguments.json else []
-    codes = [subprocess.run([sys.executable, "-m", "benchmarks", name, *as_json]).returncode for name in names]
-    sys.exit(max(codes))
+    codes = {name: subprocess.run([sys.executable, "-m", "benchmarks", name, *as_json]).returncode for name in names}
+    for name, code in codes.items():
+        print(f"{name}: {'reaches' if code == 0 else 'MISSES'} what is required", file=sys.stderr)
+    sys.exit(max(codes.values()))
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""Environment steps per second of a whole evaluation without online scores, against the bare environment on all cores.
+"""Environment steps per second of an evaluation without online scores, against the bare environment.
 
-Behaviour cloning is what the requirement is about: its network costs next to nothing, so what is missing from 100 % is
-start-up, lockstep and bookkeeping, and what busy cores lose to each other. The last is told apart by running the bare
-environment on all cores at once. The Decision Transformer (constant return-to-go) is shown beside it. The bare
-environment takes the policy's own actions, as a step costs the more, the more the robot touches. Wall clock, and
-nothing is left out: a call includes the start of its worker processes.
+The agents are those of ``train/bc.toml`` and ``train/dt.toml`` (constant return-to-go). What is missing from 100 % are
+their networks, lockstep and bookkeeping. The bare environment runs in as many processes at once, because busy cores
+slow each other down, before and after the evaluation, and takes the policy's own actions, as a step costs the more, the
+more the robot touches. Wall clock. The start of the worker processes is in ``steps_per_s`` and ``share``; required is
+the share once all of them have finished their first part.
 """
 
 from __future__ import annotations
@@ -18,17 +18,24 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 
-from zest_rl.agents import AGENTS, load_policy
-from zest_rl.evaluation.evaluate import EvaluationConfig, evaluate, target_return
+from zest_rl.agents import load_policy
+from zest_rl.agents.configs import BCConfig, DTConfig, OptimizerConfig
+from zest_rl.evaluation.evaluate import N_JOBS, EvaluationConfig, evaluate, target_return
 from zest_rl.kitchen.behaviour import Behaviour, rollout
 from zest_rl.kitchen.env import HORIZON, env_spec
 from zest_rl.runtime.parallel import n_cores, one_thread
-from zest_rl.training.loop import TrainingConfig, fit
+from zest_rl.training.loop import fit
+from zest_rl.training.request import TrainingConfig
 from zest_rl.types import Episode
 
-REQUIRED_SHARE = 0.7
+AGENTS = {
+    "bc": BCConfig(n_networks=3, learning_rate=1e-3, dropout=0.0, batch_size=320),
+    "dt": DTConfig(context_len=1, timesteps="relative", learning_rate=1e-3, dropout=0.0, batch_size=320),
+}
+REQUIRED_SHARES = {"bc": 0.9, "dt": 0.8}
 N_RAW_EPISODES = 5
-N_EPISODES = 100
+N_EPISODES = 200
+N_PROCESSES = min(n_cores(), N_JOBS // 2)
 
 
 def raw_steps_per_s(run: Path) -> float:
@@ -54,7 +61,13 @@ def raw_steps_per_s(run: Path) -> float:
     return len(actions) / seconds
 
 
-def make_run(agent: str, folder: Path) -> Path:
+def raw_steps_per_s_at_once(run: Path) -> float:
+    """Return the steps per second of `N_PROCESSES` such processes together."""
+    with ProcessPoolExecutor(N_PROCESSES, multiprocessing.get_context("spawn")) as pool:
+        return sum(pool.map(raw_steps_per_s, [run] * N_PROCESSES))
+
+
+def make_run(agent: str, agent_config: OptimizerConfig, folder: Path) -> Path:
     """Train an agent of full size for one update on one episode of the expert; return its run folder."""
     recorded = rollout(Behaviour("micro", "expert"), 0)
     obs, actions, gt_reward = (recorded[name][0] for name in ("obs", "actions", "gt_reward"))
@@ -62,34 +75,35 @@ def make_run(agent: str, folder: Path) -> Path:
     dataset = {"id": "one-episode-v0", "env_spec": env_spec("micro").to_json(), **refs, "zest": {}}
     episode = Episode(obs, actions, np.asarray(gt_reward[1:], dtype=np.float32), terminated=False)
     config = TrainingConfig(n_updates=1, device="cpu")
-    return fit(agent, AGENTS[agent].config(), [episode], folder / agent, config, meta={"dataset": dataset})
+    return fit(agent, agent_config, [episode], folder / agent, config, meta={"dataset": dataset})
 
 
 def run() -> dict[str, object]:
-    """Return steps per second of the bare environment on all cores and of evaluations, and whether enough is met."""
-    cores, result, shares = n_cores(), {}, {}
+    """Return steps per second of the bare environment in all processes at once and of evaluations, and their shares."""
+    result: dict[str, object] = {"n_processes": N_PROCESSES, "n_episodes": N_EPISODES}
+    passed = True
     with tempfile.TemporaryDirectory() as folder, one_thread():
-        for agent in ("bc", "dt"):
-            run_dir = make_run(agent, Path(folder))
-            before = raw_steps_per_s(run_dir)
+        for agent, agent_config in AGENTS.items():
+            run_dir, ends = make_run(agent, agent_config, Path(folder)), list[tuple[int, float]]()
+            before = raw_steps_per_s_at_once(run_dir)
             start = time.perf_counter()
-            evaluate(run_dir, EvaluationConfig(n_episodes=N_EPISODES, rtg="constant"))
-            ours = N_EPISODES * HORIZON / (time.perf_counter() - start)
-            raw = (before + raw_steps_per_s(run_dir)) / 2 * cores
-            with ProcessPoolExecutor(cores, multiprocessing.get_context("spawn")) as pool:
-                together = sum(pool.map(raw_steps_per_s, [run_dir] * cores))
-            shares[agent] = ours / raw
+            evaluate(
+                run_dir,
+                EvaluationConfig(n_episodes=N_EPISODES, rtg="constant"),
+                n_workers=N_PROCESSES,
+                on_progress=lambda n, ends=ends: ends.append((n, time.perf_counter())),  # type: ignore[misc]
+            )
+            whole = N_EPISODES * HORIZON / (time.perf_counter() - start)
+            rest = ends[N_PROCESSES:]  # once each process has finished a part
+            started = sum(n for n, _ in rest) * HORIZON / (rest[-1][1] - ends[N_PROCESSES - 1][1])
+            raw = (before + raw_steps_per_s_at_once(run_dir)) / 2
             result |= {
-                f"{agent}_raw_steps_per_s": round(raw),
-                f"{agent}_raw_steps_per_s_of_all_cores_at_once": round(together),
-                f"{agent}_steps_per_s": round(ours),
-                f"{agent}_share": round(shares[agent], 3),
-                f"{agent}_share_of_all_cores_at_once": round(ours / together, 3),
+                f"{agent}_raw_steps_per_s_at_once": round(raw),
+                f"{agent}_steps_per_s": round(whole),
+                f"{agent}_steps_per_s_once_started": round(started),
+                f"{agent}_share": round(whole / raw, 3),
+                f"{agent}_share_once_started": round(started / raw, 3),
+                f"{agent}_required_share_once_started": REQUIRED_SHARES[agent],
             }
-    return {
-        "n_cores": cores,
-        "n_episodes": N_EPISODES,
-        **result,
-        "required_share": REQUIRED_SHARE,
-        "passed": shares["bc"] >= REQUIRED_SHARE,
-    }
+            passed &= started / raw >= REQUIRED_SHARES[agent]
+    return {**result, "passed": passed}

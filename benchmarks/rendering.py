@@ -18,7 +18,7 @@ from zest_rl.kitchen.tasks import TASKS
 from zest_rl.runtime.gl import select_gl_backend
 
 SIZE = 224
-REQUIRED_RATIO = 40.0
+REQUIRED_RATIO = 100.0
 N_PEER_FRAMES = 5
 N_STATES = 8
 

@@ -98,9 +98,12 @@ def _similarity(a: Doubles, b: Doubles, similarity: Similarity) -> Doubles:
 def _change(after: Doubles, before: Doubles) -> Doubles:
     """`after` (N, D) − `before` (D,) or (N, D); changes without a direction (`ZERO_DELTA`) are set to zero."""
     change = after - before
-    still = np.linalg.norm(change, axis=1) <= ZERO_DELTA * np.linalg.norm(before, axis=-1)
-    change[still] = 0.0
+    change[_is_still(change, before)] = 0.0
     return change
+
+
+def _is_still(change: Doubles, before: Doubles) -> NDArray[np.bool_]:
+    return np.asarray(np.linalg.norm(change, axis=1) <= ZERO_DELTA * np.linalg.norm(before, axis=-1))
 
 
 def _mean_over_goals(similarities: Doubles) -> FloatArray:
@@ -277,7 +280,7 @@ def _classifier(frame_embeddings: FloatArray, start_embeddings: FloatArray, goal
 def zero_deltas(frame_embeddings: FloatArray) -> NDArray[np.bool_]:
     """Which frames of an episode are unchanged against x_0 (`ZERO_DELTA`): (T+1, D) → (T+1,) bool."""
     frames = _check("frame_embeddings", frame_embeddings)
-    return np.asarray((_change(frames, frames[0]) == 0).all(axis=1))
+    return _is_still(frames - frames[0], frames[0])
 
 
 def score_views(

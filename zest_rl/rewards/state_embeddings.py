@@ -29,7 +29,7 @@ from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import Layout, read_arrays, write_arrays
 from zest_rl.runtime.cache import cache_folder
 from zest_rl.runtime.parallel import Engine, cached_jobs, chunks, run_jobs
-from zest_rl.simulation.views import each_once, state_keys
+from zest_rl.simulation.views import distinct, each_once, state_keys
 from zest_rl.sources.base import StateViews
 from zest_rl.types import FloatArray
 
@@ -134,10 +134,9 @@ class StateEmbedder:
 
         What turns out to be damaged is embedded again, in this process.
         """
-        distinct, inverse = np.unique(self.views.canonical(states), axis=0, return_inverse=True)
-        rows = self.embed_now(distinct)
+        first, inverse = distinct(self.views.canonical(states))
+        rows = self.embed_now(states[first])
         self.flush()
-        inverse = np.asarray(inverse).reshape(-1)
         return EmbeddedEpisode(np.concatenate([rows[inverse[:1]], rows]), 1 + inverse)
 
     def known(self, states: NDArray[np.float64]) -> EmbeddedEpisode | None:

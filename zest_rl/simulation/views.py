@@ -64,8 +64,19 @@ def on_grid(qpos: NDArray[np.float64], visible: slice | NDArray[np.bool_], toler
 
 def each_once(states: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the distinct rows in the order in which they first appear: (N, nq) → (U, nq)."""
-    rows, first = np.unique(states, axis=0, return_index=True)
-    return np.asarray(rows[np.argsort(first)])
+    first, _ = distinct(states)
+    return np.asarray(states[np.sort(first)])
+
+
+def distinct(states: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return where each distinct row first appears, in the order of ``np.unique``, and which of these each row is.
+
+    Columns that do not vary, most of them in an episode, do not take part in sorting.
+    """
+    varies = np.ptp(states, axis=0) > 0
+    varies[0] = True
+    _, first, inverse = np.unique(states[:, varies], axis=0, return_index=True, return_inverse=True)
+    return first, np.asarray(inverse).reshape(-1)
 
 
 def state_keys(states: NDArray[np.float64]) -> list[bytes]:
