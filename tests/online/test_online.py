@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -54,8 +55,11 @@ def few_environments(dataset_id: str, reward: Callable[[Steps], Any] | None = No
 
 @pytest.mark.parametrize("agent", AGENTS)
 def test_a_policy_learns_in_the_environment_and_is_evaluated(
-    agent: str, trained: Path, zest: Callable[..., dict[str, Any]], tmp_path: Path
+    agent: str, trained: Path, zest: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     words = [word for name, value in (SMALL | SETTINGS | AGENTS[agent]).items() for word in (f"--{name}", value)]
     words = [word.replace("_", "-") if str(word).startswith("--") else word for word in words]
 
@@ -63,6 +67,7 @@ def test_a_policy_learns_in_the_environment_and_is_evaluated(
 
     assert made["agent"] == agent
     assert made["n_updates"] > 0
+    assert not [*temporary.iterdir()]
     run = tmp_path / "run"
     left = {path.name for path in run.iterdir() if not path.name.startswith(".")}
     assert left == {

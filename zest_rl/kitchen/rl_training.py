@@ -142,6 +142,7 @@ def train(task: str, seed: int, n_steps: int, folder: Path) -> dict[str, Any]:
     """
     try:
         from stable_baselines3 import SAC as SoftActorCritic
+        from stable_baselines3.common.logger import Logger
     except ImportError as error:
         raise ZestError("experts are trained by stable-baselines3; run: pip install 'zest-rl[rl]'") from error
     import torch
@@ -150,6 +151,7 @@ def train(task: str, seed: int, n_steps: int, folder: Path) -> dict[str, Any]:
     torch.set_num_threads(1)  # networks this small are not faster with more
     env, checkpoint = ShapedKitchen(task), folder / f"{task}.checkpoint.npz"
     model = SoftActorCritic("MlpPolicy", env, seed=seed, device="cpu", buffer_size=n_steps + 1, **SAC)
+    model.set_logger(Logger(None, []))  # its own would leave a folder in the system's temporary one at each `learn`
     progress, kept = Progress(seed, n_steps), dict[str, FloatArray]()
     if checkpoint.exists():
         progress, kept = _resume(checkpoint, model, env, progress)

@@ -13,6 +13,7 @@ import safetensors.torch
 import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from zest_rl.agents import get_agent
@@ -72,6 +73,7 @@ def learn(plan: Plan, on_progress: OnProgress | None) -> None:
     try:
         recorded = None if config.from_scratch else recorded_steps(plan, actor, venv)
         model = build(config, venv, recorded, seed=seed, device=plan.device)
+        model.set_logger(Logger(None, []))  # its own would leave a folder in the system's temporary one
         if state is not None:
             with reading_record(plan.folder / CHECKPOINT, "delete it, and the run starts anew"):
                 restore(model, state)
