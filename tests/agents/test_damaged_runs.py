@@ -107,7 +107,7 @@ def test_a_damaged_environment_of_a_run_is_evaluated_or_refused(n: int, trained:
     damaged += [meta["dataset"] | {"env_spec": json.dumps(spec)} | value for value in values]
 
     def read(i: int) -> str:
-        artifacts.write_json(path, meta | {"dataset": damaged[i]})
+        path.write_text(json.dumps(meta | {"dataset": damaged[i]}))
         return hash_json(evaluate(path.parent, EvaluationConfig(n_episodes=1, seed=i), n_workers=1).summary())
 
     check_reader("environment", read, len(damaged))
