@@ -1,6 +1,6 @@
 """Makes the moving picture of docs/explore.md from the page itself, in Chromium::
 
-zest explore zest/kitchen-sdoor-mixed-v0 --no-browser
+zest explore zest/kitchen-sdoor-rl-v0 --tolerance 5e-3 --no-browser
 python docs/explore_film.py ADDRESS START.png GOAL.png [docs/images/explore.webp]
 """
 
@@ -37,7 +37,12 @@ def scenes(page: Page, start: str, goal: str) -> Iterator[int]:
     page.wait_for_selector(".cell path")
     wait_until(page, "document.querySelector('#verdict').innerText")
     yield 2600
-    page.click(".cell >> nth=0")
+    page.click("#proposal summary")
+    page.select_option("#sort", "worth")
+    page.wait_for_selector(".cell.dropped")
+    yield 2600
+    page.click("#proposal summary")
+    page.click(".cell:has-text('✓') >> nth=0")
     last = int(page.get_attribute("#episode .step", "max") or 0)
     for step in range(0, last + 1, last // 12):
         page.fill("#episode .step", str(step))
@@ -45,12 +50,15 @@ def scenes(page: Page, start: str, goal: str) -> Iterator[int]:
         wait_until(page, "document.querySelector('.chart-of')")
         yield 180
     yield 1200
-    page.click("#episode .take[data-side=goals]")
-    page.wait_for_selector("#goals .held:nth-child(2)")
-    wait_until(page, "!document.body.classList.contains('busy')")
-    yield 2000
-    page.click("#goals .held:nth-child(1) .picture")
-    wait_until(page, "!document.body.classList.contains('busy')")
+    for side, step in (("goals", last), ("starts", 0)):
+        page.fill("#episode .step", str(step))
+        page.click(f"#episode .take[data-side={side}]")
+        page.wait_for_selector(f"#{side} .held:nth-child(2)")
+        page.click(f"#{side} .held:nth-child(1) .picture")
+        wait_until(page, "!document.body.classList.contains('busy')")
+        yield 2000
+    page.fill("#episode .step", str(last))
+    wait_until(page, "document.querySelector('#verdict').innerText")
     yield 3000
 
 
