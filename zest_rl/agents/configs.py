@@ -59,6 +59,17 @@ class OptimizerConfig:
         }
 
 
+def _mlp_rules(config: BCConfig | RvSConfig) -> Rules:
+    """Return the rules of the fields that the MLPs share."""
+    return {
+        "hidden_size": whole(config.hidden_size, LARGEST_WIDTH),
+        "n_layers": few_weights(config.n_layers, config.hidden_size**2, config.n_networks),
+        "dropout": (0 <= config.dropout < 1, "in [0, 1)"),
+        "batch_size": whole(config.batch_size, LARGEST_BATCH),
+        **config.optimizer_rules(),
+    }
+
+
 @dataclass(frozen=True)
 class BCConfig(OptimizerConfig):
     """Behaviour cloning."""
@@ -75,14 +86,8 @@ class BCConfig(OptimizerConfig):
     """Transitions per update."""
 
     def __post_init__(self) -> None:
-        check_fields("BC config", self, {
-            "top_fraction": (0 < self.top_fraction <= 1, "in (0, 1]"),
-            "hidden_size": whole(self.hidden_size, LARGEST_WIDTH),
-            "n_layers": few_weights(self.n_layers, self.hidden_size**2, self.n_networks),
-            "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
-            "batch_size": whole(self.batch_size, LARGEST_BATCH),
-            **self.optimizer_rules(),
-        })  # fmt: skip
+        top_fraction = (0 < self.top_fraction <= 1, "in (0, 1]")
+        check_fields("BC config", self, {"top_fraction": top_fraction, **_mlp_rules(self)})
 
 
 @dataclass(frozen=True)
@@ -103,13 +108,7 @@ class RvSConfig(OptimizerConfig):
     """AdamW's step size after warm-up."""
 
     def __post_init__(self) -> None:
-        check_fields("RvS config", self, {
-            "hidden_size": whole(self.hidden_size, LARGEST_WIDTH),
-            "n_layers": few_weights(self.n_layers, self.hidden_size**2, self.n_networks),
-            "dropout": (0 <= self.dropout < 1, "in [0, 1)"),
-            "batch_size": whole(self.batch_size, LARGEST_BATCH),
-            **self.optimizer_rules(),
-        })  # fmt: skip
+        check_fields("RvS config", self, _mlp_rules(self))
 
 
 @dataclass(frozen=True)
