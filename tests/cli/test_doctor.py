@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Iterator
 
@@ -7,6 +8,7 @@ import pytest
 
 from zest_rl.analysis import installation
 from zest_rl.cli import doctor, main
+from zest_rl.cli.terminal import StreamUi
 from zest_rl.cli.ui import SilentUi
 
 
@@ -38,3 +40,15 @@ def test_a_check_that_breaks_is_a_failure_with_a_way_to_fix_it(
     assert "fail  rendering    OSError: libEGL.so.1 cannot be loaded" in out
     assert "→ install the GL libraries" in out
     assert "1 ok, 0 to look at, 1 failed" in out
+
+
+def test_a_check_is_shown_before_the_next_one_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = io.StringIO()
+
+    def second() -> list[installation.Check]:
+        return [installation.Check("second", "ok", f"after: {shown.getvalue().split()[:2]}")]
+
+    monkeypatch.setattr(installation, "CHECKS", {"python": installation.check_python, "second": second})
+    result = doctor.run(doctor.Config(), StreamUi(results=shown))
+    assert result["checks"][1]["detail"] == "after: ['ok', 'python']"
+    assert doctor.summary(result) == "2 ok, 0 to look at, 0 failed"

@@ -33,20 +33,13 @@ class Check:
     """What to do about it; empty when the status is ``ok``."""
 
 
-def check_installation(on_done: Callable[[], object] = lambda: None) -> list[Check]:
-    """Run all of `CHECKS`; an exception in one is a failure with the fix of `FIXES`.
-
-    Args:
-        on_done: called after each.
-    """
-    results: list[Check] = []
+def check_installation() -> Iterator[Check]:
+    """Yield the results of all `CHECKS`, each when it is known; an exception is a failure with the fix of `FIXES`."""
     for name, check in CHECKS.items():
         try:
-            results += check()
+            yield from check()
         except Exception as error:  # any error of a check is its result
-            results.append(Check(name, "fail", f"{type(error).__name__}: {error}", FIXES[name]))
-        on_done()
-    return results
+            yield Check(name, "fail", f"{type(error).__name__}: {error}", FIXES[name])
 
 
 def check_python() -> Iterator[Check]:

@@ -54,7 +54,7 @@ def _run_verb(module: ModuleType, verb: str, words: list[str]) -> int:
             )
         config_class, verb, words = configs[words[0]], f"{verb} {words[0]}", words[1:]
     config, as_json = parse_config(config_class, words, verb)
-    ui = StreamUi()
+    ui = StreamUi(results=None if as_json else sys.stdout)
     with redirect_stdout(sys.stderr), notices_by(ui):  # whatever a library prints must not mix with the result
         result: dict[str, Any] = module.run(config, ui)
     if result:

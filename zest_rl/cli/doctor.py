@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from zest_rl.cli.ui import Ui
+
+if TYPE_CHECKING:
+    from zest_rl.analysis.installation import Check
 
 
 @dataclass(frozen=True)
@@ -16,10 +19,12 @@ class Config:
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Run all checks; ``ok`` is False when one failed."""
-    from zest_rl.analysis.installation import CHECKS, check_installation
+    from zest_rl.analysis.installation import check_installation
 
-    with ui.progress("checking", len(CHECKS)) as advance:
-        checks = check_installation(advance)
+    checks = []
+    for check in check_installation():
+        checks.append(check)
+        ui.show(_line(check))
     healthy = all(check.status != "fail" for check in checks)
     return {
         "ok": healthy,
@@ -28,12 +33,13 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     }
 
 
+def _line(check: Check) -> str:
+    """Write a check and, below it, how to fix it."""
+    line = f"{check.status:<5} {check.name:<12} {check.detail}"
+    return f"{line}\n{'':<18} → {check.fix}" if check.fix else line
+
+
 def summary(result: Mapping[str, Any]) -> str:
-    """Write one line per check, and below it how to fix it."""
-    lines = []
-    for check in result["checks"]:
-        lines.append(f"{check['status']:<5} {check['name']:<12} {check['detail']}")
-        if check["fix"]:
-            lines.append(f"{'':<18} → {check['fix']}")
+    """Count the checks, which were shown while they were made."""
     counts = [sum(check["status"] == status for check in result["checks"]) for status in ("ok", "warn", "fail")]
-    return "\n".join([*lines, "{} ok, {} to look at, {} failed".format(*counts)])
+    return "{} ok, {} to look at, {} failed".format(*counts)

@@ -20,8 +20,15 @@ LINE_INTERVAL = 10.0
 class StreamUi:
     """A `Ui` on a text stream: progress bars on a terminal, a line every 10 s elsewhere."""
 
-    def __init__(self, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic) -> None:
-        self._stream = stream if stream is not None else sys.stderr
+    def __init__(
+        self,
+        stream: TextIO | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        results: TextIO | None = None,
+    ) -> None:
+        """Talk on `stream` (default stderr), and show parts of the result on `results`; None: nowhere, as for JSON."""
+        self._stream, self._results = stream if stream is not None else sys.stderr, results
         self._clock = clock
         self._bars: Progress | None = None
 
@@ -35,6 +42,11 @@ class StreamUi:
     def warn(self, text: str) -> None:
         """Print a line that starts with ``warning:``."""
         self.say(f"warning: {text}")
+
+    def show(self, text: str) -> None:
+        """Print a line of the result at once."""
+        if self._results is not None:
+            print(text, file=self._results, flush=True)
 
     @contextmanager
     def progress(self, description: str, total: int) -> Iterator[Advance]:

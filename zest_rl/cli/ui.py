@@ -1,4 +1,4 @@
-"""How a verb talks while it works: sentences, warnings, progress. All of it goes to stderr; stdout is the result's."""
+"""How a verb talks while it works: sentences, warnings, progress on stderr; on stdout the parts of the result."""
 
 from __future__ import annotations
 
@@ -23,6 +23,9 @@ class Ui(Protocol):
     def warn(self, text: str) -> None:
         """Tell what the user should know although the work goes on."""
 
+    def show(self, text: str) -> None:
+        """Print a part of the result, for people, as soon as it is known."""
+
     def progress(self, description: str, total: int) -> AbstractContextManager[Advance]:
         """Show the progress of `total` units of work for as long as the context is open; may be nested."""
 
@@ -35,6 +38,9 @@ class SilentUi:
 
     def warn(self, text: str) -> None:
         """Say nothing."""
+
+    def show(self, text: str) -> None:
+        """Show nothing."""
 
     @contextmanager
     def progress(self, description: str, total: int) -> Iterator[Advance]:
