@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -29,6 +30,7 @@ from zest_rl.kitchen.scene import (
 from zest_rl.kitchen.tasks import RING, TASKS, Task
 from zest_rl.runtime.artifacts import hash_arrays
 from zest_rl.runtime.gl import select_gl_backend
+from zest_rl.simulation import rendering
 from zest_rl.simulation.framing import hidden_views, object_geoms, seen_shares
 from zest_rl.simulation.rendering import Camera, Canvas, StateRenderer
 
@@ -193,6 +195,26 @@ def test_frames_repeat_bitwise_in_another_renderer_and_another_process(start: ND
     other = in_another_process()
     assert other.returncode == 0, other.stderr
     assert digests == {other.stdout.split()[1]}
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=list(TASKS))
+def test_what_is_out_of_sight_is_left_out_and_changes_no_pixel(
+    task: Task, start: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with open_renderer(RenderConfig(), task_cameras(task, 3)) as renderer:
+        states = start, renderer.scene.with_joint(start, task.joint, task.goal)
+        frames = [renderer.render(state) for state in states]
+        in_sight, n_seen = rendering.in_sight, list[int]()
+
+        def everything(*scene: Any) -> NDArray[np.bool_]:
+            seen = in_sight(*scene)
+            n_seen.append(int(seen.sum()))
+            return np.ones_like(seen)
+
+        monkeypatch.setattr(rendering, "in_sight", everything)
+        np.testing.assert_array_equal(frames, [renderer.render(state) for state in states])
+    assert min(n_seen) > 0
+    assert max(n_seen) < renderer.scene.model.ngeom
 
 
 def test_two_renderers_can_draw_in_turn(renderer: StateRenderer, start: NDArray[np.float64]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from zest_rl.errors import BadInput
-from zest_rl.simulation.rendering import Camera, StateRenderer
+from zest_rl.simulation.rendering import Camera, StateRenderer, in_sight
 from zest_rl.simulation.scene import Scene, compile_for_drawing
 from zest_rl.simulation.videos import write_mp4
 from zest_rl.simulation.views import each_once, on_grid, ring
@@ -75,6 +75,31 @@ def test_a_camera_without_a_distance_or_with_nan_is_refused() -> None:
     for lookat, distance in (((0.0, 0.0, 0.0), 0.0), ((0.0, float("nan"), 0.0), 1.0)):
         with pytest.raises(BadInput, match="finite numbers and a distance above 0 m"):
             Camera(lookat, distance, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("centre", "seen"),
+    [
+        ((2, 0, 0), True),
+        ((0, 0, 0), True),  # around the eye
+        ((-1, 0, 0), False),
+        ((2, 2.6, 0), True),  # at 45° the frame ends at y = ±2
+        ((2, -2.6, 0), True),
+        ((2, 2.9, 0), False),
+        ((2, -2.9, 0), False),
+        ((2, 0, 1.5), True),  # and at z = -2 and z = 1
+        ((2, 0, 1.7), False),
+        ((2, 0, -2.6), True),
+        ((2, 0, -2.9), False),
+    ],
+)
+def test_a_camera_sees_spheres_that_reach_into_its_frame(centre: tuple[float, ...], seen: bool) -> None:
+    camera = mujoco.MjvGLCamera()
+    camera.forward[:], camera.up[:] = (1, 0, 0), (0, 0, 1)
+    camera.frustum_near, camera.frustum_bottom, camera.frustum_top, camera.frustum_width = 0.1, -0.1, 0.05, 0.1
+    assert in_sight(camera, np.array([centre]), np.array([0.5])) == seen
+    camera.orthographic = 1
+    assert in_sight(camera, np.array([centre]), np.array([0.5])), "nothing is left out where no sight is a pyramid"
 
 
 def test_states_on_a_grid_keep_what_is_visible_and_appear_once_in_their_order() -> None:

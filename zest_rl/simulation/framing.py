@@ -12,11 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.simulation.bodies import Bodies, subtree
-from zest_rl.simulation.rendering import Camera, Canvas
+from zest_rl.simulation.rendering import HIDDEN_GROUP, Camera, Canvas
 from zest_rl.simulation.views import ring
 
-HIDDEN_GROUP = 5
-"""Of geoms that are not drawn; MuJoCo's default draws the groups 0 to 2."""
 Point = tuple[float, float, float]
 _DRAWN_GROUPS = 3
 _SPREAD = 30.0  # degrees to either side

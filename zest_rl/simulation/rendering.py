@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
@@ -16,7 +17,10 @@ from zest_rl.errors import BadInput
 from zest_rl.runtime.gl import open_gl
 from zest_rl.simulation.scene import Scene
 
+HIDDEN_GROUP = mujoco.mjNGROUP - 1
+"""Of geoms and sites that are not drawn; MuJoCo's default draws the groups 0 to 2."""
 _MORE_GEOMS = 1000  # tendons and the like, which are drawn but are no geoms of the model
+_ROUNDING = 1.01  # of radii
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,29 @@ class Camera:
         free.lookat[:] = self.lookat
         free.distance, free.azimuth, free.elevation = self.distance, self.azimuth, self.elevation
         return free
+
+
+def in_sight(camera: mujoco.MjvGLCamera, centres: NDArray[np.float64], radii: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which spheres, (N, 3) centres and (N,) radii in metres, a camera of square frames may see: (N,).
+
+    Those that lie outside one of the four planes from the eye through the frame's edges are out of sight.
+    """
+    if camera.orthographic:
+        return np.ones(len(radii), np.bool_)
+    forward, up, near = np.float64(camera.forward), np.float64(camera.up), camera.frustum_near
+    right, middle = np.cross(forward, up), camera.frustum_center
+    half_width = camera.frustum_width or (camera.frustum_top - camera.frustum_bottom) / 2
+    inward = np.stack(
+        (
+            near * right - (middle - half_width) * forward,
+            (middle + half_width) * forward - near * right,
+            near * up - camera.frustum_bottom * forward,
+            camera.frustum_top * forward - near * up,
+        )
+    )
+    inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+    inside: NDArray[np.bool_] = ((centres - camera.pos) @ inward.T >= -_ROUNDING * radii[:, None]).all(axis=1)
+    return inside
 
 
 class Canvas:
@@ -77,26 +104,46 @@ class Canvas:
         """Return which geom each pixel shows, (V, H, W) int32; −1 for what is no geom."""
         flags = self._scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
-        colours = self.draw(data).astype(np.int32)
+        segments = [self._shown(colours) for colours in self._draw(data)]
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
+        return np.stack(segments)
+
+    def _shown(self, colours: NDArray[np.uint8]) -> NDArray[np.int32]:
+        """Return which geom of the scene that was just drawn each of its pixels shows: (H, W, 3) → (H, W)."""
         drawn = self._scene.geoms[: self._scene.ngeom]
         geoms = np.full(len(drawn) + 1, -1, np.int32)
         for geom in drawn:
             if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.segid >= 0:
                 geoms[geom.segid + 1] = geom.objid
-        return geoms[colours @ np.array([1, 256, 65536], np.int32)]
+        return geoms[colours.astype(np.int32) @ np.array([1, 256, 65536], np.int32)]
 
     def draw(self, data: mujoco.MjData) -> NDArray[np.uint8]:
         """Draw one state after its kinematics are computed: (V, H, W, 3) uint8 RGB."""
+        return np.stack(list(self._draw(data)))
+
+    def _draw(self, data: mujoco.MjData) -> Iterator[NDArray[np.uint8]]:
+        """Draw one state from one camera after the other: (H, W, 3) each.
+
+        Geoms out of sight are left out, for GL would take as long for them as for what can be seen.
+        """
         self._gl.make_current()
-        frames = np.empty((len(self.cameras), self._rect.height, self._rect.width, 3), np.uint8)
-        for frame, camera in zip(frames, self.cameras, strict=True):
-            mujoco.mjv_updateScene(
-                self._model, data, self._option, self._perturb, camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
-            )
-            mujoco.mjr_render(self._rect, self._scene, self._context)
-            mujoco.mjr_readPixels(frame, None, self._rect, self._context)
-        return np.ascontiguousarray(frames[:, ::-1])  # GL counts rows from the bottom
+        model, scene = self._model, self._scene
+        groups, boundless = model.geom_group.copy(), model.geom_rbound == 0  # such as planes
+        try:
+            for camera in self.cameras:
+                mujoco.mjv_updateCamera(model, data, camera, scene)
+                eye = mujoco.mjv_averageCamera(*scene.camera)  # of two
+                seen = boundless | in_sight(eye, data.geom_xpos, model.geom_rbound)
+                model.geom_group[:] = np.where(seen, groups, HIDDEN_GROUP)
+                mujoco.mjv_updateScene(
+                    model, data, self._option, self._perturb, camera, mujoco.mjtCatBit.mjCAT_ALL, scene
+                )
+                mujoco.mjr_render(self._rect, scene, self._context)
+                frame = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
+                mujoco.mjr_readPixels(frame, None, self._rect, self._context)
+                yield frame[::-1]  # GL counts rows from the bottom
+        finally:
+            model.geom_group[:] = groups
 
     def close(self) -> None:
         """Free the GL context."""

@@ -20,8 +20,8 @@ from zest_rl.runtime import artifacts
 from zest_rl.runtime.gl import cached_in_thread
 from zest_rl.runtime.records import from_json
 from zest_rl.simulation.bodies import Bodies, robot_bodies
-from zest_rl.simulation.framing import HIDDEN_GROUP, ObjectRing, Point, centre, object_geoms, seen_shares
-from zest_rl.simulation.rendering import Camera
+from zest_rl.simulation.framing import ObjectRing, Point, centre, object_geoms, seen_shares
+from zest_rl.simulation.rendering import HIDDEN_GROUP, Camera
 from zest_rl.simulation.views import on_grid
 from zest_rl.sources.recorded_envs import Doubles, State, running_state
 from zest_rl.sources.stage import SIZE, Simulation, env_facts, make_simulation
