@@ -12,6 +12,7 @@ from zest_rl.metrics.statistics import (
     iqm,
     mean,
     normalized_return,
+    rank_correlation,
     representative,
     spearman,
     wilson,
@@ -101,6 +102,12 @@ def test_spearman_equals_the_rank_correlation_computed_by_hand_and_lies_in_its_i
     ranks = [np.argsort(np.argsort(x)) for x in (a, b)]
     assert estimate.value == pytest.approx(np.corrcoef(ranks)[0, 1], abs=1e-12)
     assert -1 < estimate.low < estimate.value < estimate.high < 1
+
+
+@pytest.mark.parametrize("decimals", [16, 1])
+def test_a_rank_correlation_is_scipy_s_to_the_bit_with_ties_and_without(decimals: int) -> None:
+    a, b = np.round(np.random.default_rng(decimals).normal(size=(2, 200)), decimals)
+    assert rank_correlation(a, b) == stats.spearmanr(a, b).statistic
 
 
 def test_spearman_sees_order_alone() -> None:

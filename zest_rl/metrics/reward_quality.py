@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zest_rl.errors import BadInput
-from zest_rl.metrics.statistics import Estimate, Values, over_episodes, paired
+from zest_rl.metrics.statistics import Estimate, Values, over_episodes, paired, rank_correlation
 from zest_rl.types import FloatArray
 
 SATURATED_BAND = 0.05
@@ -62,18 +62,12 @@ def value_order(scores: Sequence[FloatArray]) -> Estimate:
     1 is a score that rises at every step (Ma et al. 2024, https://arxiv.org/abs/2411.04549). Episodes whose scores are
     constant have no order and count as 0. Those of one step are left out; NaN if there are no others.
     """
-    return _against_time(scores, _rank_correlation, least=2)
+    return _against_time(scores, rank_correlation, least=2)
 
 
 def order_in_time(score: FloatArray) -> float:
     """Spearman's ρ of score (T,) and time in one episode, as in `value_order`; 0 for constant scores or one step."""
-    return 0.0 if np.ptp(score) == 0 else _rank_correlation(score, np.arange(len(score)))
-
-
-def _rank_correlation(score: FloatArray, time: NDArray[np.int_]) -> float:
-    from scipy import stats
-
-    return float(stats.spearmanr(score, time).statistic)
+    return 0.0 if np.ptp(score) == 0 else rank_correlation(score, np.arange(len(score)))
 
 
 def share_explained_by_step(scores: Sequence[FloatArray]) -> Estimate:

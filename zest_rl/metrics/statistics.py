@@ -1,10 +1,11 @@
-"""Statistics of returns and scores: normalized returns, robust means, intervals. Pure NumPy / SciPy."""
+"""Statistics of returns and scores: normalized returns, robust means, intervals. Pure NumPy."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,19 +133,29 @@ def paired(a: Values, b: Values) -> tuple[Values, Values]:
     return a, b
 
 
+def rank_correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
+    """Spearman's rank correlation of two (N,) arrays, as SciPy's, whose import takes a second."""
+    return float(np.corrcoef(_ranks(a), _ranks(b))[1, 0])
+
+
+def _ranks(values: NDArray[Any]) -> Values:
+    """Rank values from 1; equal ones share the mean of their ranks."""
+    _, where, counts = np.unique(values, return_inverse=True, return_counts=True)
+    ranks: Values = (np.cumsum(counts) - (counts - 1) / 2)[where]
+    return ranks
+
+
 def spearman(a: Values, b: Values, *, seed: int = 0, n_resamples: int = 1000) -> Estimate:
     """Spearman's rank correlation of two (N,) arrays, with a percentile bootstrap over the N pairs.
 
     NaN where one of the two is constant.
     """
-    from scipy import stats
-
     a, b = paired(a, b)
 
     def rho(i: NDArray[np.intp]) -> float:
         if np.ptp(a[i]) == 0 or np.ptp(b[i]) == 0:
             return float("nan")
-        return float(np.corrcoef(stats.rankdata(a[i]), stats.rankdata(b[i]))[1, 0])
+        return rank_correlation(a[i], b[i])
 
     return over_episodes(rho, len(a), seed=seed, n_resamples=n_resamples)
 
