@@ -52,6 +52,15 @@ def test_one_thread_or_all_cores_and_batches_of_any_size_give_the_same_vectors()
     np.testing.assert_allclose(alone, together, atol=1e-4)
 
 
+def test_a_picture_has_the_same_vector_in_any_company() -> None:
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 256, (224, 224, 3), dtype=np.uint8) for _ in range(5)]
+    embedder = load_embedder("efficientnet-lite0", device="cpu", one_thread=True)
+    assert embedder.backend == "onnxruntime"
+    one_by_one = np.concatenate([embedder.embed_images([frame]) for frame in frames])
+    np.testing.assert_array_equal(embedder.embed_images(frames), one_by_one)
+
+
 def test_a_process_that_embeds_does_not_load_torch() -> None:
     code = (
         "import sys; import numpy as np; from zest_rl.rewards.embeddings import shared_embedder;"

@@ -53,7 +53,7 @@ def batch(frames: Sequence[Frame]) -> FloatArray:
 
 
 def load(weights: Path, *, one_thread: bool) -> Callable[[FloatArray], FloatArray]:
-    """Return the network: `batch` → (N, 1280) float32.
+    """Return the network: `batch` → (N, 1280) float32, where a picture's vector does not depend on the others.
 
     Args:
         weights: file of `zest_rl.embedders.checkpoints.installed_weights`.
@@ -71,8 +71,8 @@ def load(weights: Path, *, one_thread: bool) -> Callable[[FloatArray], FloatArra
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
     def embed(inputs: FloatArray) -> FloatArray:
-        vectors: FloatArray = session.run(None, {"pixels": inputs})[0]
-        return vectors
+        # one by one: what passes between layers stays in the processor's cache
+        return np.concatenate([session.run(None, {"pixels": picture[None]})[0] for picture in inputs])
 
     return embed
 
