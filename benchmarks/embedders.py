@@ -4,13 +4,15 @@ Speed does not depend on the values of weights, so all but the embedded default 
 this project does. 224×224 pictures in batches of 8, CPU time, the best of three.
 
 The default is also computed by ONNX Runtime, in turn with torch's eager mode; both have batch norms folded into the
-convolutions. Pictures per second include the preprocessing, the ratio is that of the networks alone.
+convolutions. Pictures per second include the preprocessing, the ratios are those of the networks alone: to torch in
+batches of 8, and in those in which it is fastest here.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,7 @@ from zest_rl.embedders.checkpoints import installed_weights
 from zest_rl.embedders.networks import Network, build_lite0
 
 BATCH, REPEATS = 8, 3
+TORCH_BATCHES = (1, 2, 4, BATCH)
 REQUIRED_RATIO = 1.9
 
 
@@ -70,17 +73,23 @@ def pictures_per_second(network: Network, frames: list[np.ndarray]) -> float:
     return len(frames) / min(seconds)
 
 
-def onnx_runtime(frames: list[np.ndarray]) -> tuple[float, float]:
-    """Return pictures per second of the default by ONNX Runtime, and how many times torch's seconds are its own."""
+def onnx_runtime(frames: list[np.ndarray]) -> tuple[float, dict[int, float]]:
+    """Return the default's pictures per second by ONNX Runtime, and its speed relative to torch's, by torch's batch."""
     eager = build_lite0(installed_weights()).place(torch.device("cpu"), torch.float32)
     session = lite0.load(installed_weights(), one_thread=True)
     pixels = lite0.batch(frames)
-    ways: dict[str, Callable[[], Any]] = {
-        "torch": lambda: eager.encode_images(torch.from_numpy(pixels).to(memory_format=torch.channels_last)),
+    last = torch.from_numpy(pixels).to(memory_format=torch.channels_last)
+
+    def by_torch(batch: int) -> None:
+        for part in last.split(batch):
+            eager.encode_images(part)
+
+    ways: dict[object, Callable[[], Any]] = {
         "onnx": lambda: session(pixels),
         "whole": lambda: session(lite0.batch(frames)),
+        **{batch: partial(by_torch, batch) for batch in TORCH_BATCHES},
     }
-    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    seconds: dict[object, list[float]] = {name: [] for name in ways}
     with torch.inference_mode():
         for _ in range(1 + 3 * REPEATS):
             for name, embed in ways.items():
@@ -88,7 +97,7 @@ def onnx_runtime(frames: list[np.ndarray]) -> tuple[float, float]:
                 embed()
                 seconds[name].append(time.process_time() - start)
     best = {name: min(each[1:]) for name, each in seconds.items()}  # the first of each only warms up
-    return len(frames) / best["whole"], best["torch"] / best["onnx"]
+    return len(frames) / best["whole"], {batch: best[batch] / best["onnx"] for batch in TORCH_BATCHES}
 
 
 def run() -> dict[str, Any]:
@@ -103,6 +112,9 @@ def run() -> dict[str, Any]:
         fp32 = pictures_per_second(network.place("cpu", torch.float32), frames)
         bf16 = pictures_per_second(network.place("cpu", torch.bfloat16), frames)
         found[name] = f"D {network.dim}, {size:.0f} M weights, {fp32:.1f} fp32, {bf16:.1f} bf16 pictures/s"
-    per_second, ratio = onnx_runtime(frames)
-    found["efficientnet-lite0 by ONNX Runtime"] = f"{per_second:.1f} fp32 pictures/s, {ratio:.2f} × torch's eager mode"
-    return {**found, "required_ratio": REQUIRED_RATIO, "passed": ratio >= REQUIRED_RATIO}
+    per_second, ratios = onnx_runtime(frames)
+    found["efficientnet-lite0 by ONNX Runtime"] = (
+        f"{per_second:.1f} fp32 pictures/s, {ratios[BATCH]:.2f} × torch's eager mode in batches of {BATCH}, "
+        f"{min(ratios.values()):.2f} × at its fastest, in batches of {min(ratios, key=ratios.__getitem__)}"
+    )
+    return {**found, "required_ratio": REQUIRED_RATIO, "passed": min(ratios.values()) >= REQUIRED_RATIO}

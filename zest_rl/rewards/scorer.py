@@ -128,8 +128,9 @@ class Scorer:
         scores, n_still = [], 0
         for episode in episodes:
             scores.append(self.score_episode(episode))
-            by_view = np.moveaxis(episode.embeddings, 1, 0)
-            still = np.all([zero_deltas(frames) for frames in by_view], axis=0)
+            still = np.ones(len(episode.embeddings), np.bool_)
+            for view in range(episode.embeddings.shape[1]):
+                still[still] = zero_deltas(episode.embeddings[still, view])  # x_0 comes first, and is always still
             n_still += int(still[episode.index[1:]].sum())
         return scores, n_still
 
