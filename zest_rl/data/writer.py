@@ -378,8 +378,12 @@ def write_scored(
     arrays = [(rewards, 0)] if scores is None else [(rewards, 0), (scores, 1)]
     if any([len(array) - n_more for array in of_episodes] != n_steps for of_episodes, n_more in arrays):
         raise BadInput("rewards must have length T and scores length T+1 for every episode of the source dataset")
-    if not all(np.isfinite(array).all() for of_episodes, _ in arrays for array in of_episodes):
-        raise BadInput("rewards and scores must be finite, got NaN or infinity")
+    broken = {i for of_episodes, _ in arrays for i, array in enumerate(of_episodes) if not np.isfinite(array).all()}
+    if broken:
+        raise BadInput(
+            f"rewards and scores must be finite, got NaN or infinity in {len(broken)} of {len(n_steps)} episodes, the "
+            f"first of index {min(broken)}; look at what made them, or leave these episodes out"
+        )
     with _staged(dataset_id, 2 * trajectories.n_bytes) as staging:
         kept, of_frames = trajectories.rewards_to_keep(), scores or (None,) * len(rewards)
         scored = [_scored(*new) for new in zip(rewards, of_frames, kept, strict=True)]
