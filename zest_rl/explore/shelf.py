@@ -28,9 +28,7 @@ class Shelf:
         self._embeddings = dict[tuple[bool, str], FloatArray]()
 
     def warm_up(self) -> None:
-        """Load the network and what judges scores, so that the first picture that is dropped need not wait."""
-        import scipy.stats  # noqa: F401
-
+        """Load the network, so that the first picture that is dropped need not wait."""
         self.embedder.embed_images([np.zeros((8, 8, 3), np.uint8)])
 
     def add(self, picture: Frame) -> str:
