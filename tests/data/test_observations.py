@@ -16,7 +16,7 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 from PIL import Image
 
-from zest_rl.data.observations import choose_pictures, entries, is_numbers, numbers, stored_rows
+from zest_rl.data.observations import at_path, by_path, choose_pictures, entries, is_numbers, numbers, stored_rows
 from zest_rl.data.picture_forms import PictureForm, form_of, read_pictures
 from zest_rl.errors import BadInput, Notice
 
@@ -249,6 +249,12 @@ def test_the_only_pictures_in_colour_are_chosen_and_several_must_be_named() -> N
         choose_pictures(two, ("state",), "it", "obs")
     with pytest.raises(BadInput, match="it has no entry with pictures"):
         choose_pictures({"state": none}, (), "it")
+
+
+@pytest.mark.parametrize("path", ["gt/success", "gt/reward", "zest/score", "is_success", "gt", "gt/success/x", "empty"])
+def test_one_entry_is_found_by_the_path_that_it_has_among_all(path: str) -> None:
+    info = {"gt": {"success": True, "reward": 0.5}, "zest/score": 1.0, "/is_success": 0, "empty": {}}
+    assert at_path(info, path) == by_path(info).get(path)
 
 
 def test_numbers_of_a_dictionary_are_flattened_as_gymnasium_flattens_them(group: h5py.Group) -> None:

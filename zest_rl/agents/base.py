@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -66,7 +67,12 @@ class DataFacts:
 
     def normalize(self, obs: FloatArray) -> FloatArray:
         """Return observations (…, obs_dim) as networks take them, float32 of the same shape: see `standardized`."""
-        return standardized(obs, self.obs_mean, self.obs_std)
+        return standardized(obs, *self._mean_and_std)
+
+    @cached_property
+    def _mean_and_std(self) -> tuple[FloatArray, FloatArray]:
+        """As arrays: to convert the numbers takes longer than to normalise the observations of a few episodes."""
+        return np.array(self.obs_mean, np.float32), np.array(self.obs_std, np.float32)
 
 
 def returns_to_go(rewards: FloatArray) -> FloatArray:

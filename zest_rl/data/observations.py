@@ -25,10 +25,10 @@ MAX_STANDARDIZED = 10.0
 """Standard deviations; so many a joint is away that moves for the first time after the data."""
 
 
-def standardized(obs: FloatArray, mean: Sequence[float], std: Sequence[float]) -> FloatArray:
+def standardized(obs: FloatArray, mean: Sequence[float] | FloatArray, std: Sequence[float] | FloatArray) -> FloatArray:
     """Return ``(obs - mean) / std`` clipped to ± `MAX_STANDARDIZED`; obs and result (…, obs_dim) float32."""
-    scaled = (obs - np.array(mean, dtype=np.float32)) / np.array(std, dtype=np.float32)
-    return np.clip(scaled, -MAX_STANDARDIZED, MAX_STANDARDIZED).astype(np.float32)
+    scaled = (obs - np.asarray(mean, dtype=np.float32)) / np.asarray(std, dtype=np.float32)
+    return np.minimum(np.maximum(scaled, -MAX_STANDARDIZED), MAX_STANDARDIZED).astype(np.float32, copy=False)
 
 
 def entries(node: h5py.Group | h5py.Dataset, prefix: str = "") -> dict[str, h5py.Dataset]:
@@ -159,6 +159,16 @@ def by_path(values: Any, prefix: str = "") -> dict[str, Any]:
         path = f"{prefix}/{name}" if prefix else str(name).lstrip("/")
         found |= by_path(part, path) if isinstance(part, Mapping) else {path: part}
     return found
+
+
+def at_path(values: Mapping[Any, Any], path: str) -> Any:
+    """Return ``by_path(values).get(path)``, without visiting all entries where the keys are the parts of the path."""
+    part: Any = values
+    for name in path.split("/"):
+        if not isinstance(part, Mapping) or name not in part:
+            return by_path(values).get(path)
+        part = part[name]
+    return by_path(values).get(path) if isinstance(part, Mapping) else part
 
 
 def observed(observations: Sequence[Any]) -> dict[str, NDArray[Any]]:

@@ -26,7 +26,7 @@ from zest_rl.data.env_specs import (
     is_maker,
     without_wrappers,
 )
-from zest_rl.data.observations import by_path, flatten, numeric_paths, observed
+from zest_rl.data.observations import at_path, by_path, flatten, numeric_paths, observed
 from zest_rl.data.provenance import DatasetRecord
 from zest_rl.errors import BadInput, Notice, ZestError, nearest
 from zest_rl.kitchen.env import ENV_ID, env_spec
@@ -86,19 +86,18 @@ class RunEnvironment:
         arrays = observed(observations)
         return flatten({path: arrays[path] for path in self.observed})
 
-    def tell(
-        self, env: gymnasium.Env[Any, Any], reward: float | None, info: Mapping[str, Any]
-    ) -> dict[str, NDArray[Any]]:
-        """Return one time step of the traces: gt_reward, gt_success where it is told, and the parts of the state.
+    def tell(self, env: gymnasium.Env[Any, Any], reward: float | None, info: Mapping[str, Any]) -> dict[str, Any]:
+        """Return one time step of the traces: gt_reward (float32), gt_success (bool) where it is told, and the parts of
+        the state (n,).
 
         `reward` is None at the reset, at which only the kitchen tells one.
         """
         if reward is None:
-            reward = (by_path(info).get("gt/reward") or 0.0) if self.is_kitchen else 0.0
-        told: dict[str, NDArray[Any]] = {"gt_reward": np.asarray(reward, np.float32)}
+            reward = (at_path(info, "gt/reward") or 0.0) if self.is_kitchen else 0.0
+        told: dict[str, Any] = {"gt_reward": np.float32(reward)}
         if self.success_key is not None:
-            value = by_path(info).get(self.success_key)
-            told["gt_success"] = np.array(value is not None and bool(np.any(value)))
+            value = at_path(info, self.success_key)
+            told["gt_success"] = value is not None and bool(np.asarray(value).any())
         return told | running_state(env.unwrapped, self.state)
 
 
@@ -106,11 +105,12 @@ KITCHEN = RunEnvironment("", 1, "gt/success", ("qpos",), FPS)
 """What a kept evaluation in zest/Kitchen-v1 says of it: there is nothing to choose."""
 
 
-def act_in(env: gymnasium.Env[Any, Any], action: FloatArray) -> Any:
-    """Return an action (act_dim,) of a policy in the form and the bounds of the environment's space."""
+def act_in(env: gymnasium.Env[Any, Any], actions: FloatArray) -> Any:
+    """Return actions (…, act_dim) of a policy in the form and the bounds of the environment's space."""
     space = env.action_space
     assert isinstance(space, gymnasium.spaces.Box)
-    return np.minimum(np.maximum(action.reshape(space.shape), space.low), space.high).astype(space.dtype)
+    shaped = actions.reshape(*actions.shape[:-1], *space.shape)
+    return np.minimum(np.maximum(shaped, space.low), space.high).astype(space.dtype)
 
 
 def find_environment(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal
 
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
@@ -75,8 +74,11 @@ def run_episodes(
     envs = [environment.make() for _ in seeds]
     resets = [env.reset(seed=seed) for env, seed in zip(envs, seeds, strict=True)]
     observations = [first for first, _ in resets]
-    told = [environment.tell(env, None, info) for env, (_, info) in zip(envs, resets, strict=True)]
-    trace, scores = [_stacked(told)], list[FloatArray]()
+    trace = _first_frames(
+        [environment.tell(env, None, info) for env, (_, info) in zip(envs, resets, strict=True)],
+        environment.horizon + 1,
+    )
+    scores = list[FloatArray]()
     if reward is not None:
         scores.append(reward.of_obs(environment.flatten(observations)))
     elif scorer is not None:
@@ -89,17 +91,21 @@ def run_episodes(
         for step in range(environment.horizon):
             running, rewards = np.flatnonzero(n_steps > step), np.zeros(len(envs), np.float32)
             if len(running):
-                actions = policy.act(environment.flatten(observations))
-            for i in running:
-                observations[i], rewards[i], terminated, truncated, info = _step(
-                    envs[i], actions[i], f"{environment.name} failed in step {step + 1} from seed {seeds[i]}"
-                )
-                told[i] = environment.tell(envs[i], float(rewards[i]), info)
+                actions = act_in(envs[0], policy.act(environment.flatten(observations)))
+            for i in running.tolist():
+                try:
+                    observations[i], rewards[i], terminated, truncated, info = envs[i].step(actions[i])
+                except ZestError:
+                    raise
+                except Exception as error:  # whatever an environment raises
+                    raise ZestError(
+                        f"{environment.name} failed in step {step + 1} from seed {seeds[i]} ({type(error).__name__}: "
+                        f"{error}); mend it, or choose another --seed"
+                    ) from error
+                for name, part in environment.tell(envs[i], float(rewards[i]), info).items():
+                    trace[name][i, step + 1] = part
                 if terminated or truncated:
                     n_steps[i] = step + 1
-            trace.append(_stacked(told))
-            for i in np.flatnonzero(n_steps == step + 1):
-                told[i] = {name: part * (not name.startswith("gt_")) for name, part in told[i].items()}
             if scores:
                 scores.append(np.zeros(len(envs), np.float32))
                 if reward is not None and len(running):
@@ -115,7 +121,10 @@ def run_episodes(
         results_of_policy = policy.end()
         for env in envs:
             env.close()
-    arrays = {name: np.stack([step[name] for step in trace], axis=1) for name in trace[0]} | results_of_policy
+    for i, end in enumerate(n_steps):
+        for name, part in trace.items():
+            part[i, end + 1 :] = part[i, end] * (not name.startswith("gt_"))
+    arrays = trace | results_of_policy
     if scores:
         arrays["score"] = np.stack(scores, axis=1)
     return arrays if environment.is_kitchen else arrays | {"n_steps": n_steps}
@@ -125,18 +134,14 @@ def _record(policy: Policy | RecordedPolicy) -> DatasetRecord:
     return DatasetRecord.of_run(policy.meta)
 
 
-def _step(env: gymnasium.Env[Any, Any], action: FloatArray, what: str) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-    try:
-        return env.step(act_in(env, action))
-    except ZestError:
-        raise
-    except Exception as error:  # whatever an environment raises
-        raise ZestError(f"{what} ({type(error).__name__}: {error}); mend it, or choose another --seed") from error
-
-
-def _stacked(rows: list[dict[str, NDArray[Any]]]) -> Traces:
-    """Join the rows of N episodes at one time step."""
-    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+def _first_frames(told: list[dict[str, Any]], n_frames: int) -> Traces:
+    """Return room for `n_frames` of N episodes, (N, n_frames, …) by name, with what is told of the first one."""
+    trace = {}
+    for name in told[0]:
+        first = np.stack([row[name] for row in told])
+        trace[name] = np.empty((len(told), n_frames, *first.shape[1:]), first.dtype)
+        trace[name][:, 0] = first
+    return trace
 
 
 def _decrement(policy: Policy, rtg: Rtg, step: int, rewards: FloatArray) -> FloatArray:
