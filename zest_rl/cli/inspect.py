@@ -29,7 +29,13 @@ class Config:
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
-    """Measure, judge, write the page."""
+    """Measure, judge, write the page; or find it written."""
+    from zest_rl.report.finished import PageRecord, dataset_contents
+
+    record = PageRecord(config.output, "inspect", [*map(dataset_contents, config.datasets)])
+    if not config.trust and (made := record.result()) is not None:
+        ui.say(f"{config.output} is there already, nothing to do")
+        return made
     from zest_rl.analysis.cross_task import inspect_datasets
     from zest_rl.report.html import write_report
     from zest_rl.report.inspection_page import inspection_report
@@ -46,7 +52,8 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     if first := next(usable, None):
         name = first.dataset_id
         command = f"zest train dt {name}" if first.suits_agents else f"zest export {name} --to npz"
-    return {**inspected.to_json(), "report": str(page), "next": command}
+    result = {**inspected.to_json(), "report": str(page), "next": command}
+    return result if inspected.left_out else record.keep(result)  # what is left out may be there the next time
 
 
 def summary(result: Mapping[str, Any]) -> str:

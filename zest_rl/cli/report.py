@@ -30,14 +30,20 @@ class Config:
 
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
-    """Group the runs by method, build the report, write it."""
+    """Group the runs by method, build the report, write it; or find it written."""
+    from zest_rl.report.finished import PageRecord, runs_contents
+
+    record = PageRecord(config.output, "report", config.title, runs_contents(config.runs))
+    if not config.trust and (made := record.result()) is not None:
+        ui.say(f"{config.output} is there already, nothing to do")
+        return made
     from zest_rl.report.comparison_page import compare_runs
     from zest_rl.report.html import write_report
-    from zest_rl.report.sections import RESULTS
+    from zest_rl.report.sections import EPISODES, RESULTS
 
     report = compare_runs(config.runs, title=config.title, trust=config.trust)
     path, rows = write_report(report, config.output), report.items(RESULTS)
-    return {
+    result = {
         "report": str(path),
         "rows": {row.method: round(row.mean, 2) for row in rows},
         "intervals": {row.method: [round(row.ci_low, 2), round(row.ci_high, 2)] for row in rows},
@@ -46,6 +52,7 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "sentence": report.summary,
         "next": f"open {path} in a browser",
     }
+    return record.keep(result) if report.items(EPISODES) else result  # they may be drawn the next time
 
 
 def summary(result: Mapping[str, Any]) -> str:
