@@ -263,12 +263,12 @@ class Dataset:
         `DatasetRecord.of_run` reads it.
 
         Raises:
-            BadInput: as in `episodes`.
+            BadInput: as in `fingerprint` and `rewards`.
         """
         return {
             "id": self.id,
             "sha256": self.fingerprint(),
-            "rewards_sha256": artifacts.hash_arrays(*(episode.rewards for episode in self.episodes())),
+            "rewards_sha256": artifacts.hash_arrays(*self.rewards()),
             "env_spec": self.record.env_spec,
             "ref_min_score": self.record.ref_min_score,
             "ref_max_score": self.record.ref_max_score,

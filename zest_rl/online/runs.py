@@ -13,18 +13,15 @@ from __future__ import annotations
 import importlib.util
 import random
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
 
-from zest_rl.agents import get_agent
-from zest_rl.agents.base import describe_data
-from zest_rl.agents.configs import START, OnlineConfig
-from zest_rl.agents.online import OnlineAgent
+from zest_rl.agents.configs import START, OnlineConfig, config_of
 from zest_rl.data.folders import CARD_FILE
 from zest_rl.data.reader import Dataset, open_dataset
 from zest_rl.errors import BadInput
@@ -32,8 +29,14 @@ from zest_rl.evaluation.environments import find_environment
 from zest_rl.online.rewards import OnlineReward, learned_reward, own_reward
 from zest_rl.rewards.cards import policy_card
 from zest_rl.runtime import artifacts
-from zest_rl.training.loop import torch_set_up, training_device
-from zest_rl.training.request import OnProgress, RunConfig, TrainingConfig, check_request
+from zest_rl.training.request import (
+    OnProgress,
+    RunConfig,
+    TrainingConfig,
+    check_request,
+    data_sha256,
+    is_finished,
+)
 from zest_rl.training.runs import default_run_dir, scorer_files
 from zest_rl.training.runs import train as train_on_data
 from zest_rl.types import Episode
@@ -72,56 +75,74 @@ def train(
     for package in ("stable_baselines3", "sb3_contrib"):
         if importlib.util.find_spec(package) is None:
             raise BadInput(f"`zest train {agent}` needs {package}: pip install 'zest-rl[rl]'")
-    from zest_rl.online.learning import CHECKPOINT, Plan, learn
-
-    definition, config = get_agent(agent), RunConfig() if config is None else config
-    assert isinstance(definition, OnlineAgent)
-    agent_config = definition.config() if agent_config is None else agent_config
+    config = RunConfig() if config is None else config
+    agent_config = config_of(agent)() if agent_config is None else agent_config
+    assert isinstance(agent_config, OnlineConfig)
     run_dir = run_dir or default_run_dir(agent, dataset_id, config.seed)
     with open_dataset(dataset_id) as dataset:
         if agent_config.reward == "truth" and not dataset.record.has_recorded_rewards:
             source = dataset.record.source_id
             own = replace(agent_config, reward="own")
             return train(agent, source, own, config, run_dir=run_dir, on_progress=on_progress)
-        episodes, meta, files = dataset.episodes(), {"dataset": dataset.describe()}, scorer_files(dataset)
-        facts, device = describe_data(episodes), training_device(config.device)
-        threads = torch.get_num_threads() if config.threads is None else config.threads
+        episodes = dataset.episodes()
         request = {
             "agent": agent,
             "config": asdict(agent_config),
             "seed": config.seed,
-            "device": str(device),
-            "threads": threads,
+            "device": None if config.device == "auto" else config.device,
+            "threads": config.threads,
             "snapshot_every": config.snapshot_every,
             "precision": "fp32",
-            "data_sha256": artifacts.hash_arrays(*(a for e in episodes for a in (e.obs, e.actions, e.rewards))),
-            **meta,
+            "data_sha256": data_sha256(episodes),
+            "dataset": dataset.describe(),
         }
-        described = request | asdict(facts)
-        environment = find_environment(described)
-        if agent_config.reward != "trex":  # refused before anything is written
-            reward = reward_of(agent_config.reward, dataset, episodes)
-        with artifacts.lock(run_dir):
-            check_request(run_dir, request)
-            if (run_dir / "meta.json").exists():
-                return run_dir
-            with torch_set_up(config.seed, threads, device), _random_numbers_kept():
-                on_data = TrainingConfig(seed=config.seed, device=config.device, threads=threads)
-                if agent_config.reward == "trex":
-                    ranking = replace(on_data, n_updates=TREX_UPDATES)
-                    trex = train_on_data("trex", dataset_id, None, ranking, run_dir=run_dir / "reward")
-                    reward = learned_reward(trex, dataset, episodes)
-                if not agent_config.from_scratch:
-                    cloning = replace(on_data, n_updates=agent_config.start_updates)
-                    train_on_data("bc", dataset_id, START, cloning, run_dir=run_dir / "start")
-                plan = Plan(
-                    run_dir, agent_config, config, described, files, facts, episodes, environment, reward, device
-                )
-                learn(plan, on_progress)
-            artifacts.write_bytes(run_dir / CARD_FILE, policy_card(artifacts.read_json(run_dir / "meta.json")).encode())
-            (run_dir / CHECKPOINT).unlink(missing_ok=True)
-            shutil.rmtree(run_dir / "start", ignore_errors=True)
+        if not is_finished(run_dir, request):
+            _learn(dataset, episodes, request, agent_config, config, run_dir, on_progress)
     return run_dir
+
+
+def _learn(
+    dataset: Dataset,
+    episodes: Sequence[Episode],
+    request: Mapping[str, Any],
+    agent_config: OnlineConfig,
+    config: RunConfig,
+    run_dir: Path,
+    on_progress: OnProgress | None,
+) -> None:
+    """Learn what is asked for; only this imports torch and stable-baselines3, which take longer than a finished run."""
+    import torch
+
+    from zest_rl.agents.base import describe_data
+    from zest_rl.online.learning import CHECKPOINT, Plan, learn
+    from zest_rl.training.loop import torch_set_up, training_device
+
+    facts, device = describe_data(episodes), training_device(config.device)
+    threads = torch.get_num_threads() if config.threads is None else config.threads
+    request = {**request, "device": str(device), "threads": threads}
+    described = request | asdict(facts)
+    environment = find_environment(described)
+    if agent_config.reward != "trex":  # refused before anything is written
+        reward = reward_of(agent_config.reward, dataset, episodes)
+    with artifacts.lock(run_dir):
+        check_request(run_dir, request)
+        if (run_dir / "meta.json").exists():
+            return
+        with torch_set_up(config.seed, threads, device), _random_numbers_kept():
+            on_data = TrainingConfig(seed=config.seed, device=config.device, threads=threads)
+            if agent_config.reward == "trex":
+                ranking = replace(on_data, n_updates=TREX_UPDATES)
+                trex = train_on_data("trex", dataset.id, None, ranking, run_dir=run_dir / "reward")
+                reward = learned_reward(trex, dataset, episodes)
+            if not agent_config.from_scratch:
+                cloning = replace(on_data, n_updates=agent_config.start_updates)
+                train_on_data("bc", dataset.id, START, cloning, run_dir=run_dir / "start")
+            files = scorer_files(dataset)
+            plan = Plan(run_dir, agent_config, config, described, files, facts, episodes, environment, reward, device)
+            learn(plan, on_progress)
+        artifacts.write_bytes(run_dir / CARD_FILE, policy_card(artifacts.read_json(run_dir / "meta.json")).encode())
+        (run_dir / CHECKPOINT).unlink(missing_ok=True)
+        shutil.rmtree(run_dir / "start", ignore_errors=True)
 
 
 def reward_of(spec: str, dataset: Dataset, episodes: Sequence[Episode]) -> OnlineReward:

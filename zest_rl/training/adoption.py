@@ -28,6 +28,7 @@ from zest_rl.rewards.cards import policy_card
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.privacy import masked
 from zest_rl.runtime.trust import remember
+from zest_rl.training.request import data_sha256
 from zest_rl.training.runs import default_run_dir, scorer_files
 from zest_rl.types import Episode
 
@@ -88,7 +89,7 @@ def adopt(
         "policy": identity.to_json(),
         "obs_dim": facts.obs_dim,
         "act_dim": facts.act_dim,
-        "data_sha256": artifacts.hash_arrays(*(a for e in episodes for a in (e.obs, e.actions, e.rewards))),
+        "data_sha256": data_sha256(episodes),
         "dataset": description,
     }
     remember("policy", request["policy"])

@@ -63,6 +63,7 @@ def fit(
     run_dir: Path,
     config: TrainingConfig,
     *,
+    request: Mapping[str, Any] | None = None,
     meta: Mapping[str, Any] = MappingProxyType({}),
     files: Mapping[str, bytes] = MappingProxyType({}),
     on_progress: OnProgress | None = None,
@@ -77,6 +78,8 @@ def fit(
         episodes: the data; their rewards are the only information about quality.
         run_dir: folder of this run alone.
         config: how long and where.
+        request: what `zest_rl.training.request.asked` returned for these arguments, if it was called: it hashes the
+            data.
         meta: facts about the data (JSON), copied into ``meta.json`` beside the run's own; part of the run's identity.
         files: name → content of further files of the run and its snapshots.
         on_progress: see `OnProgress`.
@@ -97,8 +100,8 @@ def fit(
     judge = definition.judge(agent_config, facts, episodes)
     launched().share(sample(np.random.default_rng(config.seed)))  # a batch that is too small is refused first
     precision = resolve_precision(agent_config.amp, device)
-    request = asked(agent, agent_config, episodes, config)
-    request |= {"device": str(device), "precision": precision}
+    asked_for = asked(agent, agent_config, episodes, config) if request is None else request
+    request = {**asked_for, "device": str(device), "precision": precision}
     if config.threads is None:
         request["threads"] = torch.get_num_threads()
     if launched().size > 1:

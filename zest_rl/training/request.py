@@ -65,6 +65,11 @@ class OnProgress(Protocol):
         """Take the number of updates since the last call (at first, since update 0), and the row by `COLUMNS`."""
 
 
+def data_sha256(episodes: Sequence[Episode]) -> str:
+    """Hash everything that is learned from."""
+    return artifacts.hash_arrays(*(array for e in episodes for array in (e.obs, e.actions, e.rewards)))
+
+
 def asked(agent: str, agent_config: Any, episodes: Sequence[Episode], config: TrainingConfig) -> dict[str, Any]:
     """Return what ``run.json`` holds of a training; None for what the machine decides, if it is left to it."""
     return {
@@ -76,7 +81,7 @@ def asked(agent: str, agent_config: Any, episodes: Sequence[Episode], config: Tr
         "threads": config.threads,
         "snapshot_every": config.snapshot_every,
         "precision": None,
-        "data_sha256": artifacts.hash_arrays(*(a for e in episodes for a in (e.obs, e.actions, e.rewards))),
+        "data_sha256": data_sha256(episodes),
     }
 
 
@@ -85,7 +90,7 @@ def is_finished(run_dir: Path, request: Mapping[str, Any]) -> bool:
 
     Args:
         run_dir: the run's folder.
-        request: what `asked` returned, and the facts about the data.
+        request: what `asked` returned, or `zest_rl.online.runs.train` asks for, and the facts about the data.
     """
     path = run_dir / "run.json"
     if not (path.exists() and (run_dir / "meta.json").exists()) or (run_dir / "checkpoints").exists():

@@ -54,10 +54,12 @@ def train(
             embeddings = embeddings_of(dataset, dataset.path / SCORER_FILE, device=config.device)
             episodes = [replace(e, obs=seen.mean(axis=1)) for e, seen in zip(episodes, embeddings, strict=True)]
     run_dir = run_dir or default_run_dir(agent, dataset_id, config.seed)
-    if launched().size > 1 or not is_finished(run_dir, asked(agent, agent_config, episodes, config) | meta):
+    request = asked(agent, agent_config, episodes, config)
+    if launched().size > 1 or not is_finished(run_dir, request | meta):
         from zest_rl.training.loop import fit  # imports torch, which takes longer than all else for a finished run
 
-        fit(agent, agent_config, episodes, run_dir, config, meta=meta, files=files, on_progress=on_progress)
+        options: dict[str, Any] = {"meta": meta, "files": files, "on_progress": on_progress}
+        fit(agent, agent_config, episodes, run_dir, config, request=request, **options)
     if launched().leads:
         for folder, (name, content) in product((run_dir, *snapshots(run_dir)), files.items()):
             if not (folder / name).exists():  # earlier versions wrote it when all else was there
