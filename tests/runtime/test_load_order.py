@@ -30,6 +30,9 @@ import numpy
 import zest_rl
 film = numpy.random.default_rng(0).integers(0, 256, (3, 32, 32, 3), numpy.uint8)
 print(zest_rl.score(film, goal=film[2]).scores[-1].round(3))
+import importlib.util
+if importlib.util.find_spec("triton"):  # torch loads it when it compiles
+    import triton
 """
 AGAIN = """
 renderer.update_scene(data)
