@@ -344,6 +344,14 @@ def test_a_damaged_cache_gives_the_same_rewards_without_a_word(
     assert capsys.readouterr() == ("", "")
 
 
+def test_what_was_relabeled_before_is_found_without_rendering(
+    relabeled: Relabeled, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Views, "shared_renderer", lambda views: pytest.fail("GL takes longer than all else"))
+    again = relabel_kitchen(CONFIG, n_workers=1)
+    assert (again.dataset_id, again.already_there) == (relabeled.dataset_id, True)
+
+
 @pytest.mark.parametrize("kind", ["embeddings", "goals"])
 def test_a_cache_of_other_numbers_is_refused_before_anything_is_written(
     kind: str, relabeled: Relabeled, places: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

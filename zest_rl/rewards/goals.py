@@ -29,6 +29,8 @@ from zest_rl.kitchen.tasks import Task, get_task
 from zest_rl.kitchen.toys import toy_pictures
 from zest_rl.kitchen.views import Views, scene_pair
 from zest_rl.runtime import artifacts
+from zest_rl.runtime.arrays import read_arrays, write_arrays
+from zest_rl.runtime.cache import cache_folder
 from zest_rl.runtime.files import is_there, user_path
 from zest_rl.types import Frame
 
@@ -175,20 +177,36 @@ def read_goal(spec: str, task: Task, scene: tuple[NDArray[np.uint8], NDArray[np.
     return read_text(spec) if folder is None else read_folder(folder, spec)
 
 
-def read_kitchen_goal(spec: str, views: Views, scene_qpos: NDArray[np.float64]) -> GoalSpec:
+def read_kitchen_goal(spec: str, views: Views, scene_qpos: NDArray[np.float64], *, anew: bool = False) -> GoalSpec:
     """Read a goal spec of a kitchen task, and render the scene for a same-scene goal.
 
     Args:
         spec: see the module's docstring.
         views: of the task.
         scene_qpos: (nq,) a start state of the scene.
+        anew: render it and keep the pictures in the cache, which are read without being rendered otherwise.
 
     Raises:
         BadInput: as `read_goal`.
     """
-    task = get_task(views.task)
-    scene = scene_pair(views.shared_renderer(), scene_qpos, task) if spec == SAME_SCENE else None
-    return read_goal(spec, task, scene)
+    scene = _scene_cached(views, scene_qpos, anew=anew) if spec == SAME_SCENE else None
+    return read_goal(spec, get_task(views.task), scene)
+
+
+def _scene_cached(
+    views: Views, qpos: NDArray[np.float64], *, anew: bool
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return the `scene_pair`, from the cache if it is there: opening GL takes longer than finding finished work."""
+    task, size = get_task(views.task), views.size
+    digest = artifacts.hash_json([views.fingerprint(), task.joint, task.goal, artifacts.hash_arrays(qpos)])
+    path, form = cache_folder("goals") / f"scene-{digest[:20]}.npz", (np.uint8, (views.n_drawn, size, size, 3))
+    cached = None if anew else read_arrays(path, {"starts": form, "goals": form})
+    if cached is not None:
+        return cached["starts"], cached["goals"]
+    starts, goals = scene_pair(views.shared_renderer(), qpos, task)
+    if anew:
+        write_arrays(path, {"starts": starts, "goals": goals})
+    return starts, goals
 
 
 def free_goal_folder(spec: str) -> Path | None:

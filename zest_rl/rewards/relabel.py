@@ -22,6 +22,7 @@ from zest_rl.rewards.cards import dataset_card
 from zest_rl.rewards.embeddings import EmbeddedEpisode, EpisodeEmbeddings
 from zest_rl.rewards.episode_goals import read_source_goal
 from zest_rl.rewards.frame_embeddings import FrameEmbeddings
+from zest_rl.rewards.goals import SAME_SCENE
 from zest_rl.rewards.scorer import SCORER_FILE, Scorer, ScorerConfig
 from zest_rl.rewards.scores import Features, Reward, Similarity
 from zest_rl.rewards.state_embeddings import StateEmbedder, StateEmbeddings
@@ -201,7 +202,8 @@ def relabel_source(
     with artifacts.lock(path):
         if reader.exists(target_id):  # an equal call that ran at the same time
             return existing()
-        scorer.check_goal(device)
+        rendered = read_source_goal(config.goal, source, anew=True) if config.goal == SAME_SCENE else None
+        scorer.check_goal(device, rendered)
         embeddings.embed(on_progress)
         kept = scorer.goals_near(embeddings) if config.goal_share < 1 else None
         scorer = scorer if kept is None else scorer.with_goals(kept)

@@ -100,16 +100,22 @@ class Scorer:
         starts, goals = embed_goal_cached(goal, embedder)
         return cls(config, starts, goals, goal.fingerprint(), embedder.fingerprint, embedder.backend, views, goal)
 
-    def check_goal(self, device: str) -> None:
-        """Embed a start and a goal again, and compare, because they may be from the cache; raises as `check_equal`."""
-        if self.goal is None:
+    def check_goal(self, device: str, goal: GoalSpec | None = None) -> None:
+        """Embed a start and a goal again, and compare, because they may be from the cache; raises as `check_equal`.
+
+        Args:
+            device: of the embedder.
+            goal: the goal, rendered again; None: its pictures are not from the cache.
+        """
+        goal = goal or self.goal
+        if goal is None:
             return
         config = self.config
         embedder = shared_embedder(config.embedder, config.precision, device, config.backend)
-        i, k = np.random.default_rng().integers([len(self.goal.starts), len(self.goal.goals)])
-        pair = replace(self.goal, starts=self.goal.starts[i : i + 1], goals=self.goal.goals[k : k + 1])
-        start, goal = embed_goal(pair, embedder)
-        check_equal(cache_folder("goals"), [(self.starts[i], start[0]), (self.goals[k], goal[0])])
+        i, k = np.random.default_rng().integers([len(goal.starts), len(goal.goals)])
+        pair = replace(goal, starts=goal.starts[i : i + 1], goals=goal.goals[k : k + 1])
+        starts, goals = embed_goal(pair, embedder)
+        check_equal(cache_folder("goals"), [(self.starts[i], starts[0]), (self.goals[k], goals[0])])
 
     def score(self, embeddings: FloatArray) -> FloatArray:
         """Score frames of one episode: (n, V, D) embeddings, the first of x_0 → (n,) float32."""
