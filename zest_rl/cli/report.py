@@ -37,12 +37,14 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     if not config.trust and (made := record.result()) is not None:
         ui.say(f"{config.output} is there already, nothing to do")
         return made
-    from zest_rl.report.comparison_page import compare_runs
-    from zest_rl.report.html import write_report
-    from zest_rl.report.sections import EPISODES, RESULTS
+    with ui.progress("drawing the report", 1) as advance:
+        from zest_rl.report.comparison_page import compare_runs
+        from zest_rl.report.html import write_report
+        from zest_rl.report.sections import EPISODES, RESULTS
 
-    report = compare_runs(config.runs, title=config.title, trust=config.trust)
-    path, rows = write_report(report, config.output), report.items(RESULTS)
+        report = compare_runs(config.runs, title=config.title, trust=config.trust)
+        path, rows = write_report(report, config.output), report.items(RESULTS)
+        advance()
     result = {
         "report": str(path),
         "rows": {row.method: round(row.mean, 2) for row in rows},

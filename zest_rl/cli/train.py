@@ -53,9 +53,8 @@ def split_config(config: Any) -> tuple[Any, Any]:
 def run(config: Arguments, ui: Ui) -> dict[str, Any]:
     """Train, or go on training; of several processes under ``torchrun`` the first one tells."""
     from zest_rl.data.provenance import DatasetRecord
-    from zest_rl.evaluation.environments import is_evaluable
     from zest_rl.runtime import artifacts
-    from zest_rl.training.runs import default_run_dir
+    from zest_rl.training.request import default_run_dir
 
     ui = ui if launched().leads else SilentUi()
     agent_config, training = split_config(config)
@@ -69,6 +68,8 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
         how.train(config.agent, config.dataset, agent_config, training, run_dir=run_dir, on_progress=show)
     if not launched().leads:
         return {}
+    from zest_rl.evaluation.environments import is_evaluable  # brings a simulator, and nothing should wait for that
+
     meta, folder = artifacts.read_json(run_dir / "meta.json"), shlex.quote(str(run_dir))
     following = f"evaluate {folder}" if is_evaluable(DatasetRecord.of_run(meta)) else f"export {config.dataset}"
     learned, is_reward = f"relabel {config.dataset} --reward {folder}", config.agent == "trex"

@@ -35,9 +35,10 @@ from zest_rl.training.request import (
     TrainingConfig,
     check_request,
     data_sha256,
+    default_run_dir,
     is_finished,
 )
-from zest_rl.training.runs import default_run_dir, scorer_files
+from zest_rl.training.runs import scorer_files
 from zest_rl.training.runs import train as train_on_data
 from zest_rl.types import Episode
 
@@ -61,7 +62,7 @@ def train(
         dataset_id: Minari dataset; its environment, its scorer and its episodes are learned from.
         agent_config: that agent's config; default its defaults.
         config: where, and what is kept.
-        run_dir: folder of this run alone; default `zest_rl.training.runs.default_run_dir`.
+        run_dir: folder of this run alone; default `zest_rl.training.request.default_run_dir`.
         on_progress: called after every logged row.
 
     Returns:

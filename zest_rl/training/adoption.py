@@ -28,8 +28,8 @@ from zest_rl.rewards.cards import policy_card
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.privacy import masked
 from zest_rl.runtime.trust import remember
-from zest_rl.training.request import data_sha256
-from zest_rl.training.runs import default_run_dir, scorer_files
+from zest_rl.training.request import data_sha256, default_run_dir
+from zest_rl.training.runs import scorer_files
 from zest_rl.types import Episode
 
 N_TRIED = 8

@@ -110,6 +110,11 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def default_run_dir(label: str, dataset_id: str, seed: int) -> Path:
+    """Return ``runs/DATASET-LABEL-seedN``, where the label is the agent or the adopted policy's name."""
+    return Path("runs") / f"{dataset_id.split('/')[-1]}-{label}-seed{seed}"
+
+
 def check_request(run_dir: Path, request: dict[str, Any]) -> None:
     """Write ``run.json``, or check that the existing one holds the same arguments.
 

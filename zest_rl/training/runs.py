@@ -14,7 +14,7 @@ from zest_rl.rewards.cards import policy_card
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.hub import REWARD_FILES, SCORER_FILE
 from zest_rl.training.distributed import launched
-from zest_rl.training.request import OnProgress, TrainingConfig, asked, is_finished, snapshots
+from zest_rl.training.request import OnProgress, TrainingConfig, asked, default_run_dir, is_finished, snapshots
 
 
 def train(
@@ -33,7 +33,7 @@ def train(
         dataset_id: Minari dataset; its rewards are the only information about quality.
         agent_config: that agent's config; default its defaults.
         config: how long and where; default the defaults of `TrainingConfig`.
-        run_dir: folder of this run alone; default `default_run_dir`.
+        run_dir: folder of this run alone; default `zest_rl.training.request.default_run_dir`.
         on_progress: see `OnProgress`.
 
     Returns:
@@ -67,11 +67,6 @@ def train(
         if not (run_dir / CARD_FILE).exists():
             artifacts.write_bytes(run_dir / CARD_FILE, policy_card(artifacts.read_json(run_dir / "meta.json")).encode())
     return run_dir
-
-
-def default_run_dir(label: str, dataset_id: str, seed: int) -> Path:
-    """Return ``runs/DATASET-LABEL-seedN``, where the label is the agent or the adopted policy's name."""
-    return Path("runs") / f"{dataset_id.split('/')[-1]}-{label}-seed{seed}"
 
 
 def scorer_files(dataset: Dataset) -> dict[str, bytes]:
