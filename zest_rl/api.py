@@ -102,9 +102,9 @@ def relabel(
         reward: "level", the score after each action; "difference", its change; or what ``train("trex", …)`` returned,
             whose learned rewards are written instead (`zest_rl.rewards.by_learned.relabel_by_run`).
         **flags: frames, camera, env, robot, look_at, views, show_robot, tolerance, skip_incomplete, masks, embedder,
-            features, similarity, precision, backend, goal_share, shuffle, device, n_workers, engine, on_start,
-            on_progress; of a learned reward device, n_workers and engine. What `zest relabel --preview` draws,
-            `zest_rl.rewards.preview.preview` draws.
+            features, similarity, precision, backend, vectors, goal_share, shuffle, device, n_workers, engine,
+            on_start, on_progress; of a learned reward device, n_workers and engine. What `zest relabel --preview`
+            draws, `zest_rl.rewards.preview.preview` draws.
     """
     from zest_rl.rewards.by_learned import relabel_by_run
     from zest_rl.rewards.relabel import relabel as relabel_dataset
@@ -200,7 +200,7 @@ def explore(
         port: of 127.0.0.1; 0: any that is free.
         browser: open the page.
         **flags: what is seen, as in `relabel`: frames, camera, env, robot, look_at, views, show_robot, tolerance,
-            skip_incomplete, masks, embedder, precision, device, backend, n_workers.
+            skip_incomplete, masks, embedder, precision, device, backend, vectors, n_workers.
     """
     import webbrowser
 

@@ -343,6 +343,20 @@ def test_broken_weights_are_reported_instead_of_nan(timm_model: torch.nn.Module,
         load_embedder(f"timm:resnet10t@{tmp_path / 'nan.pth'}").embed_images([np.zeros((8, 8, 3), np.uint8)] * 2)
 
 
+def test_a_number_that_float16_cannot_hold_is_reported_instead_of_infinity(
+    timm_model: torch.nn.Module, tmp_path: Path
+) -> None:
+    state = {name: value * 10 if "conv3.weight" in name else value for name, value in timm_model.state_dict().items()}
+    last = [name for name in state if name.startswith("layer4") and name.endswith("bn2.weight")][-1]
+    state[last] = torch.full_like(state[last], 1e7)
+    torch.save(state, tmp_path / "large.pth")
+    frames = [np.full((8, 8, 3), 200, np.uint8)]
+    assert np.isfinite(load_embedder(f"timm:resnet10t@{tmp_path / 'large.pth'}").embed_images(frames)).all()
+    halves = load_embedder(f"timm:resnet10t@{tmp_path / 'large.pth'}", vectors="float16")
+    with pytest.raises(ZestError, match=r"returned \d+, and float16 holds 65504 at most; leave --vectors float16 out"):
+        halves.embed_images(frames)
+
+
 @pytest.mark.parametrize(
     "uri", ["timm:resnet10t", "open_clip:ViT-B-32/openai", "torchvision:resnet50", "torchvision:resnet50/IMAGENET1K_V1"]
 )
@@ -392,6 +406,8 @@ def test_a_wrong_option_is_refused() -> None:
         load_embedder("efficientnet-lite0", precision="fp16")  # type: ignore[arg-type]
     with pytest.raises(BadInput, match="batch_size must be at least 1, got 0"):
         load_embedder("efficientnet-lite0", batch_size=0)
+    with pytest.raises(BadInput, match=r"unknown type of vectors 'fp16'; did you mean 'float16'"):
+        load_embedder("efficientnet-lite0", vectors="fp16")  # type: ignore[arg-type]
 
 
 # ---- registered from outside ----

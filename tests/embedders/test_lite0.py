@@ -64,7 +64,7 @@ def test_a_picture_has_the_same_vector_in_any_company() -> None:
 def test_a_process_that_embeds_does_not_load_torch() -> None:
     code = (
         "import sys; import numpy as np; from zest_rl.rewards.embeddings import shared_embedder;"
-        "embedder = shared_embedder('efficientnet-lite0', 'auto', 'cpu', 'auto');"
+        "embedder = shared_embedder('efficientnet-lite0', 'auto', 'cpu', 'auto', 'float32');"
         "embedder.embed_images([np.zeros((224, 224, 3), np.uint8)]);"
         "print([name for name in ('torch', 'torchvision', 'timm') if name in sys.modules])"
     )

@@ -88,6 +88,24 @@ def test_the_kitchen_embedded_by_distinct_states_is_the_kitchen_embedded_frame_b
         np.testing.assert_allclose(one.embeddings[one.index], other.embeddings[other.index], atol=1e-4)
 
 
+def test_float16_embeddings_take_half_of_the_space_and_are_those_of_float32_rounded(
+    source: Source, tmp_path: Path
+) -> None:
+    expected, files = filled(source, tmp_path / "cache")
+    for n_workers in (1, 2, 1):  # the last one finds them in the cache
+        halves = FrameEmbeddings(source, "efficientnet-lite0", vectors="float16", device="cpu", n_workers=n_workers)
+        halves.embed()
+        for episode, whole in zip(halves, expected, strict=True):
+            np.testing.assert_array_equal(episode.embeddings, whole.astype(np.float16).astype(np.float32))
+            assert episode.embeddings.dtype == np.float32
+        if n_workers == 1:
+            small = set((tmp_path / "cache").glob("frames/*/*.npz")) - set(files)
+            assert len(small) == len(files)
+            assert max(path.stat().st_size for path in small) < 0.6 * min(path.stat().st_size for path in files)
+            for path in small if halves.n_embedded else ():
+                path.unlink()
+
+
 # --- damage and other numbers -----------------------------------------------------------------------------------------
 
 

@@ -213,6 +213,22 @@ def test_a_scorer_goes_on_with_the_backend_that_made_it(
     assert (loaded.config.backend, loaded.record) == (backend, made.record)
 
 
+def test_a_scorer_goes_on_with_embeddings_of_the_type_that_made_it(episodes: list[np.ndarray], tmp_path: Path) -> None:
+    halves, whole = (
+        StateScorer.build(replace(CONFIG, vectors=vectors), VIEWS, episodes[0][0], device="cpu", n_workers=1)
+        for vectors in ("float16", "float32")
+    )
+    np.testing.assert_array_equal(halves.scorer.goals, whole.scorer.goals.astype(np.float16).astype(np.float32))
+    assert halves.scorer.fingerprint() != whole.scorer.fingerprint(), "which names the dataset"
+    assert [each.scorer.record.to_json()["config"].get("vectors") for each in (halves, whole)] == ["float16", None]
+    halves.scorer.save(tmp_path / "scorer.safetensors")
+    loaded = StateScorer.load(tmp_path / "scorer.safetensors", device="cpu", n_workers=1)
+    assert loaded.scorer.record == halves.scorer.record
+    assert loaded.embedder.folder == halves.embedder.folder != whole.embedder.folder
+    for first, second in zip(score_all(loaded, episodes)[0], score_all(halves, episodes)[0], strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
 def test_a_scorer_of_other_weights_is_refused(tmp_path: Path) -> None:
     import timm
 

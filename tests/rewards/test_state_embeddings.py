@@ -287,10 +287,28 @@ def test_embeddings_do_not_depend_on_torchs_threads_and_leave_them_alone(
     np.testing.assert_array_equal(*results)
 
 
+# --- half precision ---
+
+
+def test_float16_embeddings_are_those_of_float32_rounded_wherever_they_come_from(cache: Path) -> None:
+    states = opening(3)
+    expected = single().embed_now(states).astype(np.float16).astype(np.float32)
+    halves = single(vectors="float16")
+    np.testing.assert_array_equal(halves.embed_now(states), expected)
+    halves.flush()
+    for embedder in (single(vectors="float16"), StateEmbedder(VIEWS, EMBEDDER, vectors="float16", n_workers=2)):
+        embedder.embed(np.concatenate([states, opening(2, last=-0.5)]))
+        np.testing.assert_array_equal(embedder.embed_now(states), expected)
+    for path in halves.folder.glob("*.npz"):
+        arrays = read_arrays(path)
+        assert arrays is not None
+        assert arrays["embeddings"].dtype == np.float16
+
+
 # --- one cache per way of looking ---
 
 
-def test_other_views_networks_precisions_or_backends_have_another_cache_and_another_device_has_not() -> None:
+def test_other_views_networks_precisions_backends_or_types_have_another_cache_and_another_device_has_not() -> None:
     embedders = [
         single(),
         single(replace(VIEWS, n_views=3)),
@@ -299,6 +317,7 @@ def test_other_views_networks_precisions_or_backends_have_another_cache_and_anot
         single(replace(VIEWS, tolerance=0)),
         single(precision="bf16"),
         single(backend="torch"),
+        single(vectors="float16"),
     ]
     folders = [embedder.folder for embedder in embedders]
     assert len(set(folders)) == len(embedders)

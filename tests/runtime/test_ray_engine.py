@@ -160,14 +160,14 @@ def test_an_unknown_engine_is_an_error(tmp_path: Path) -> None:
 
 
 def test_an_embedder_that_is_another_on_the_worker_is_refused() -> None:
-    embedder = shared_embedder("efficientnet-lite0", "fp32", "cpu", "auto")
-    assert WorkerEmbedder("efficientnet-lite0", "fp32", "cpu", "auto", embedder.cache_key).load() is embedder
+    embedder = shared_embedder("efficientnet-lite0", "fp32", "cpu", "auto", "float32")
+    assert WorkerEmbedder("efficientnet-lite0", "fp32", "cpu", "auto", "float32", embedder.cache_key).load() is embedder
     for other in (
-        shared_embedder("efficientnet-lite0", "bf16", "cpu", "auto"),
-        shared_embedder("efficientnet-lite0", "fp32", "cpu", "torch"),
+        shared_embedder("efficientnet-lite0", "bf16", "cpu", "auto", "float32"),
+        shared_embedder("efficientnet-lite0", "fp32", "cpu", "torch", "float32"),
     ):
         with pytest.raises(BadInput, match="is not that of the process that asked"):
-            WorkerEmbedder("efficientnet-lite0", "fp32", "cpu", "auto", other.cache_key).load()
+            WorkerEmbedder("efficientnet-lite0", "fp32", "cpu", "auto", "float32", other.cache_key).load()
 
 
 def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

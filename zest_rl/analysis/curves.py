@@ -22,7 +22,6 @@ from zest_rl.data.images import decode_image, list_images, read_image
 from zest_rl.data.video import frame_times, iter_frames
 from zest_rl.embedders import DEFAULT_EMBEDDER, Precision
 from zest_rl.errors import BadInput
-from zest_rl.rewards.embeddings import shared_embedder
 from zest_rl.rewards.frame_embeddings import STEPS_PER_BATCH
 from zest_rl.rewards.goals import TEXT, GoalSpec, read_folder, read_text
 from zest_rl.rewards.scorer import Scorer, ScorerConfig
@@ -162,7 +161,7 @@ def score(
     spec = read_states(start, goal, first)
     scorer = Scorer.build(ScorerConfig(spec.name, embedder, features, similarity, precision), spec, device=device)
     scorer.check_goal(device)
-    network, parts, last = shared_embedder(embedder, precision, device, "auto"), [], first
+    network, parts, last = scorer.config.load_embedder(device), [], first
     rest = chain([first], frames)
     while batch := list(islice(rest, STEPS_PER_BATCH)):
         parts.append(network.embed_images(batch))

@@ -56,6 +56,8 @@ class ScorerRecord:
     backend: str = "torch"
     """What computed the embeddings of the goal and, unless a GPU did, of the frames; before there was a choice, torch.
     It is no part of a dataset's name: "torch" and "onnxruntime" agree to 1e-5 of an embedding's length."""
+    vectors: str = "float32"
+    """Of the numbers of all embeddings, which float16 has rounded."""
     views: Mapping[str, Any] | None = None
     """Of a `ViewsRecord`, from which kitchen states were rendered; of a scorer's file, also those of another scene."""
     views_sha256: str | None = None
@@ -76,6 +78,8 @@ class ScorerRecord:
         config = {name: getattr(self, name) for name in names}
         if self.backend != "torch":  # so that records of torch stay as they were
             config["backend"] = self.backend
+        if self.vectors != "float32":  # likewise of those that were not rounded
+            config["vectors"] = self.vectors
         if self.views is None:
             return {"config": config, **hashes}
         return {"config": {"views": dict(self.views), **config}, **hashes, "views_sha256": self.views_sha256}

@@ -26,7 +26,7 @@ import importlib.util
 import re
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
@@ -44,11 +44,14 @@ if TYPE_CHECKING:
 
     from zest_rl.embedders.base import Network
 
-__all__ = ["DEFAULT_EMBEDDER", "Backend", "Embedder", "Precision", "find_device", "load_embedder"]
+__all__ = ["DEFAULT_EMBEDDER", "Backend", "Embedder", "Precision", "Vectors", "find_device", "load_embedder"]
 
 Precision = Literal["auto", "fp32", "bf16"]
 Backend = Literal["auto", "torch"]
 """What computes the default embedder in fp32 on a CPU: ONNX Runtime if it is installed, or torch in any case."""
+Vectors = Literal["float32", "float16"]
+"""Type of an embedding's numbers; float16 takes half of the space in the cache. They are rounded when they are
+computed, so that it does not matter whether an embedding comes from there."""
 ONNX_RUNTIME = "onnxruntime"
 GPU_DRIVERS = ("/proc/driver/nvidia", "/dev/dxg", "/dev/nvhost-gpu", "/dev/kfd")
 """Where Linux shows a GPU that torch may use: NVIDIA's, also through WSL and of a Jetson, and AMD's."""
@@ -63,7 +66,7 @@ class Embedder(Protocol):
 
     @property
     def fingerprint(self) -> str:
-        """64 hex digits over network, weights, preprocessing and precision; not over device, backend or batch size."""
+        """64 hex digits over network, weights, preprocessing, precision and type; not device, backend, batch size."""
 
     @property
     def backend(self) -> str:
@@ -78,6 +81,10 @@ class Embedder(Protocol):
         """Length D of a vector."""
 
     @property
+    def vectors(self) -> Vectors:
+        """The smallest type that holds the vectors as they are: that of the cache."""
+
+    @property
     def reads_text(self) -> bool:
         """Whether `embed_texts` works."""
 
@@ -86,7 +93,7 @@ class Embedder(Protocol):
 
         Raises:
             BadInput: a frame has another shape or dtype.
-            ZestError: the network returned NaN or infinity.
+            ZestError: the network returned NaN or infinity, or a number that float16 cannot hold.
         """
 
     def embed_texts(self, sentences: Sequence[str]) -> FloatArray:
@@ -94,7 +101,7 @@ class Embedder(Protocol):
 
         Raises:
             BadInput: this network reads no text.
-            ZestError: the network returned NaN or infinity, or its tokenizer is not available.
+            ZestError: as in `embed_images`, or its tokenizer is not available.
         """
 
 
@@ -105,6 +112,7 @@ def load_embedder(
     precision: Precision = "auto",
     batch_size: int = 16,
     backend: Backend = "auto",
+    vectors: Vectors = "float32",
     one_thread: bool = False,
 ) -> Embedder:
     """Return the embedder that `uri` names (see the table above).
@@ -117,16 +125,20 @@ def load_embedder(
             against ≥ .9999 for ViT-B/32 and ResNet50).
         batch_size: frames or sentences per forward pass.
         backend: "auto", or "torch" for vectors that equal those of versions without ONNX Runtime.
+        vectors: "float32", or "float16" to round the numbers of all vectors to that type; they are returned as float32.
         one_thread: compute on one thread, so that vectors do not depend on the number of cores.
 
     Raises:
-        BadInput: unknown family, model, tag, device or backend; a checkpoint that cannot be read or does not fit.
+        BadInput: unknown family, model, tag, device, backend or type of vectors; a checkpoint that cannot be read or
+            does not fit.
         ZestError: the weights are not cached and cannot be fetched.
     """
     if precision not in get_args(Precision):
         raise BadInput(f"unknown precision {precision!r}; {nearest(precision, get_args(Precision))}")
     if backend not in get_args(Backend):
         raise BadInput(f"unknown backend {backend!r}; {nearest(backend, get_args(Backend))}")
+    if vectors not in get_args(Vectors):
+        raise BadInput(f"unknown type of vectors {vectors!r}; {nearest(vectors, get_args(Vectors))}")
     if batch_size < 1:
         raise BadInput(f"batch_size must be at least 1, got {batch_size}")
     _check_device(device)
@@ -144,17 +156,20 @@ def load_embedder(
             [uri, hash_file(weights), LITE0_PREPROCESSING, bf16, "batch norms folded, padded evenly"]
         )
         by_onnx = backend == "auto" and not bf16 and importlib.util.find_spec(ONNX_RUNTIME) and _is_cpu(device)
-        return _NetworkEmbedder(
+        embedder = _NetworkEmbedder(
             uri, fingerprint, 1280, False, batch_size, one_thread, load_lite0, weights if by_onnx else None
         )
+    else:
+        from zest_rl.embedders.networks import build
 
-    from zest_rl.embedders.networks import build
-
-    network = build(uri)
-    fingerprint = _fingerprint(uri, network, bf16)
-    _place(network, device, bf16)
-    reads_text = network.encode_texts is not None
-    return _NetworkEmbedder(uri, fingerprint, network.dim, reads_text, batch_size, one_thread, lambda: network)
+        network = build(uri)
+        fingerprint = _fingerprint(uri, network, bf16)
+        _place(network, device, bf16)
+        reads_text = network.encode_texts is not None
+        embedder = _NetworkEmbedder(uri, fingerprint, network.dim, reads_text, batch_size, one_thread, lambda: network)
+    if vectors == "float32":
+        return embedder
+    return replace(embedder, fingerprint=hash_json([fingerprint, vectors]), vectors=vectors)
 
 
 @dataclass(frozen=True)
@@ -170,6 +185,7 @@ class _NetworkEmbedder:
     load: Callable[[], Network]
     lite0_weights: Path | None = None
     """Of the default embedder if ONNX Runtime computes it."""
+    vectors: Vectors = "float32"
 
     @property
     def backend(self) -> str:
@@ -228,7 +244,14 @@ class _NetworkEmbedder:
                 f"{self.uri} returned NaN or infinity for {len(bad)} of {len(items)} {what}s (the first is {what} "
                 f"{bad[0]}); try precision fp32, and if that does not help use other weights, for these are broken"
             )
-        return vectors
+        if self.vectors == "float32":
+            return vectors
+        if (largest := np.abs(vectors).max(initial=0)) > np.finfo(np.float16).max:
+            raise ZestError(
+                f"{self.uri} returned {largest:.0f}, and float16 holds {np.finfo(np.float16).max:.0f} at most; leave "
+                "--vectors float16 out"
+            )
+        return vectors.astype(np.float16).astype(np.float32)
 
 
 def _check_device(device: str) -> None:

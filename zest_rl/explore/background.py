@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 STOPS_WITHIN = 10.0
 """Seconds."""
-EMBEDDING = {"embedder": "efficientnet-lite0", "precision": "auto", "device": "auto", "backend": "auto"}
+EMBEDDING = {
+    "embedder": "efficientnet-lite0", "precision": "auto", "device": "auto", "backend": "auto", "vectors": "float32",
+}  # fmt: skip
 """Arguments of `open_embeddings`, with their defaults."""
 OPTIONS = (
     "frames", "camera", "env", "robot", "look_at", "views", "show_robot", "tolerance", "skip_incomplete", "masks",

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.embedders import Backend, Embedder, Precision, load_embedder
+from zest_rl.embedders import Backend, Embedder, Precision, Vectors, load_embedder
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.types import FloatArray
 
@@ -82,9 +82,9 @@ def check_equal(folder: Path, pairs: Iterable[tuple[FloatArray | None, FloatArra
 
 
 @functools.lru_cache(maxsize=2)
-def shared_embedder(uri: str, precision: Precision, device: str, backend: Backend) -> Embedder:
+def shared_embedder(uri: str, precision: Precision, device: str, backend: Backend, vectors: Vectors) -> Embedder:
     """Return this process's embedder of a URI, on one thread; the default's network is loaded at its first picture."""
-    return load_embedder(uri, device=device, precision=precision, backend=backend, one_thread=True)
+    return load_embedder(uri, device=device, precision=precision, backend=backend, vectors=vectors, one_thread=True)
 
 
 @dataclass(frozen=True)
@@ -95,6 +95,7 @@ class WorkerEmbedder:
     precision: Precision
     device: str
     backend: Backend
+    vectors: Vectors
     cache_key: str
     """Of the embedder of the process that asks; it names the cache."""
 
@@ -104,7 +105,7 @@ class WorkerEmbedder:
         Raises:
             BadInput: weights, precision, backend or versions differ between the machines.
         """
-        embedder = shared_embedder(self.uri, self.precision, self.device, self.backend)
+        embedder = shared_embedder(self.uri, self.precision, self.device, self.backend, self.vectors)
         if embedder.cache_key != self.cache_key:
             raise BadInput(
                 f"embedder {self.uri} of this worker is not that of the process that asked: weights, precision, "

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.embedders import Backend, Precision
+from zest_rl.embedders import Backend, Precision, Vectors
 from zest_rl.errors import BadInput
 from zest_rl.rewards.embeddings import N_CHECKED, EmbeddedEpisode, WorkerEmbedder, check_equal, shared_embedder
 from zest_rl.runtime import artifacts
@@ -72,7 +72,7 @@ def _embed_episode(shared: _Shared, job: _Job) -> dict[str, NDArray[Any]]:
             f"episode {job.episode} has {job.n_steps} actions, so it needs {job.n_steps + 1} frames (x_0 … x_T), or "
             f"{job.n_steps} without the last; got {number}. Are these the frames of this episode, one for each step?"
         )
-    return {"embeddings": np.concatenate(parts)[index]}
+    return {"embeddings": np.concatenate(parts).astype(embedder.vectors, copy=False)[index]}
 
 
 def _embed_frame(shared: _Shared, place: tuple[int, int]) -> FloatArray:
@@ -100,21 +100,23 @@ class FrameEmbeddings:
         precision: Precision = "auto",
         *,
         backend: Backend = "auto",
+        vectors: Vectors = "float32",
         device: str = "auto",
         n_workers: int | None = None,
         engine: Engine = "local",
     ) -> None:
         """Hash the frames of a source.
 
-        `embedder` is a URI, `precision`, `backend` and `device` as in `zest_rl.embedders.load_embedder`; `n_workers`
-        and `engine` as in `zest_rl.runtime.parallel.run_jobs`.
+        `embedder` is a URI, `precision`, `backend`, `vectors` and `device` as in `zest_rl.embedders.load_embedder`;
+        `n_workers` and `engine` as in `zest_rl.runtime.parallel.run_jobs`.
 
         Raises:
             BadInput: frames or the embedder cannot be read.
         """
-        network = shared_embedder(embedder, precision, device, backend)
-        self._shared = _Shared(source.frames, WorkerEmbedder(embedder, precision, device, backend, network.cache_key))
-        self._layout: Layout = {"embeddings": (np.float32, (None, len(source.frames.views), network.dim))}
+        network = shared_embedder(embedder, precision, device, backend, vectors)
+        worker = WorkerEmbedder(embedder, precision, device, backend, vectors, network.cache_key)
+        self._shared, dtype = _Shared(source.frames, worker), np.dtype(vectors).type
+        self._layout: Layout = {"embeddings": (dtype, (None, len(source.frames.views), network.dim))}
         self._source, self._n_workers, self._engine = source, n_workers, engine
         self._n_steps = source.trajectories.n_steps
         self._digests = [source.frames.digest(episode) for episode in range(len(self._n_steps))]
@@ -181,7 +183,7 @@ class FrameEmbeddings:
                 arrays = _embed_episode(self._shared, _Job(i, n_steps))
                 write_arrays(self._path(i), arrays)
                 self.n_embedded += 1
-                frames = arrays["embeddings"]
+                frames = arrays["embeddings"].astype(np.float32, copy=False)
             yield _whole(frames, n_steps)
 
     def read(self, episode: int) -> EmbeddedEpisode | None:
@@ -192,7 +194,9 @@ class FrameEmbeddings:
     def _read(self, episode: int) -> FloatArray | None:
         """Return the embeddings of an episode's T or T + 1 frames, (n, V, D); None: not in the cache, or damaged."""
         arrays, n_steps = read_arrays(self._path(episode), self._layout), self._n_steps[episode]
-        return arrays["embeddings"] if arrays and len(arrays["embeddings"]) in (n_steps, n_steps + 1) else None
+        if not arrays or len(arrays["embeddings"]) not in (n_steps, n_steps + 1):
+            return None
+        return arrays["embeddings"].astype(np.float32, copy=False)
 
     def _path(self, episode: int) -> Path:
         return self._folder / f"{self._digests[episode][:32]}.npz"

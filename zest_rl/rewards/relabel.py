@@ -15,7 +15,7 @@ from zest_rl.data import reader
 from zest_rl.data.folders import CARD_FILE, GOAL_FOLDER
 from zest_rl.data.provenance import RelabelRecord
 from zest_rl.data.writer import write_scored
-from zest_rl.embedders import DEFAULT_EMBEDDER, Backend, Precision
+from zest_rl.embedders import DEFAULT_EMBEDDER, Backend, Precision, Vectors
 from zest_rl.errors import BadInput, nearest
 from zest_rl.kitchen.views import Views
 from zest_rl.rewards.cards import dataset_card
@@ -117,6 +117,7 @@ def relabel(
     similarity: Similarity = "cos",
     precision: Precision = "auto",
     backend: Backend = "auto",
+    vectors: Vectors = "float32",
     goal_share: float = 1.0,
     **options: Any,
 ) -> Relabeled:
@@ -125,7 +126,7 @@ def relabel(
     `dataset` and `frames` … `masks` choose the frames (`open_source`), `goal` and `embedder` … `goal_share`
     the scorer (`ScorerConfig`); the other options and the errors are those of `relabel_source`.
     """
-    config = ScorerConfig(goal, embedder, features, similarity, precision, goal_share, backend)
+    config = ScorerConfig(goal, embedder, features, similarity, precision, goal_share, backend, vectors)
     source = open_source(
         dataset,
         frames=frames,
@@ -249,7 +250,7 @@ def _open(
     ring = frames.ring if isinstance(frames, KitchenStates) else None
     scorer = Scorer.build(config, read_source_goal(config.goal, source), views=ring, device=device)
     options: dict[str, Any] = {"device": device, "n_workers": n_workers, "engine": engine}
-    return scorer, open_embeddings(source, config.embedder, config.precision, backend=config.backend, **options)
+    return scorer, open_embeddings(source, **config.embedding(), **options)
 
 
 def open_embeddings(source: Source, embedder: str, precision: Precision = "auto", **options: Any) -> EpisodeEmbeddings:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from zest_rl.data.env_specs import is_maker
 from zest_rl.data.provenance import ScorerRecord
-from zest_rl.embedders import DEFAULT_EMBEDDER, ONNX_RUNTIME, Backend, Embedder, Precision
+from zest_rl.embedders import DEFAULT_EMBEDDER, ONNX_RUNTIME, Backend, Embedder, Precision, Vectors
 from zest_rl.errors import BadInput, ZestError
 from zest_rl.kitchen.views import Views
 from zest_rl.rewards.embeddings import EmbeddedEpisode, check_equal, shared_embedder
@@ -62,10 +62,19 @@ class ScorerConfig:
     goal_share: float = 1.0
     """Share of the goals that are used: the nearest to the ends of the episodes (`Scorer.goals_near`)."""
     backend: Backend = "auto"
+    vectors: Vectors = "float32"
 
     def __post_init__(self) -> None:
         check_names(self.features, self.similarity)
         check_goal_share(self.goal_share)
+
+    def load_embedder(self, device: str) -> Embedder:
+        """Return this process's embedder; raises as `zest_rl.embedders.load_embedder`."""
+        return shared_embedder(self.embedder, self.precision, device, self.backend, self.vectors)
+
+    def embedding(self) -> dict[str, Any]:
+        """Return the arguments of `zest_rl.rewards.relabel.open_embeddings` that choose the embedder."""
+        return {name: getattr(self, name) for name in ("embedder", "precision", "backend", "vectors")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +103,7 @@ class Scorer:
         Raises:
             BadInput: the goal is a sentence and the embedder reads pictures only.
         """
-        embedder = shared_embedder(config.embedder, config.precision, device, config.backend)
+        embedder = config.load_embedder(device)
         if config.embedder != DEFAULT_EMBEDDER:
             remember("embedder", config.embedder)
         starts, goals = embed_goal_cached(goal, embedder)
@@ -110,8 +119,7 @@ class Scorer:
         goal = goal or self.goal
         if goal is None:
             return
-        config = self.config
-        embedder = shared_embedder(config.embedder, config.precision, device, config.backend)
+        embedder = self.config.load_embedder(device)
         i, k = np.random.default_rng().integers([len(goal.starts), len(goal.goals)])
         pair = replace(goal, starts=goal.starts[i : i + 1], goals=goal.goals[k : k + 1])
         starts, goals = embed_goal(pair, embedder)
@@ -222,7 +230,7 @@ class Scorer:
         """
         config, views, saved, starts, goals = _read(path)
         _check_named(path, config, views)
-        embedder = shared_embedder(config.embedder, config.precision, device, config.backend)
+        embedder = config.load_embedder(device)
         scorer = cls(config, starts, goals, saved.goal_sha256, embedder.fingerprint, embedder.backend, views)
         record = scorer.record
         changed = [key for key in ("embedder_sha256", "views_sha256") if getattr(record, key) != getattr(saved, key)]

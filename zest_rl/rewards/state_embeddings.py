@@ -1,7 +1,7 @@
 """Simulator states → embeddings of all views, each distinct state rendered and embedded once, cached by content.
 
-The cache is a folder of shards ``keys (n, width) float64, embeddings (n, V, D) float32``; its name is a hash of
-everything that an embedding depends on. Any process may add shards; each is written atomically and never changed.
+The cache is a folder of shards ``keys (n, width) float64, embeddings (n, V, D) float32`` or float16; its name is a hash
+of everything that an embedding depends on. Any process may add shards; each is written atomically and never changed.
 
 One state is one batch of V frames on one thread, so that its embedding does not depend on the states embedded with it:
 networks are exact only up to about 1e-6 across batch sizes and thread counts. States of equal frames that come together
@@ -23,7 +23,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from zest_rl.embedders import Backend, Precision
+from zest_rl.embedders import Backend, Precision, Vectors
 from zest_rl.rewards.embeddings import N_CHECKED, EmbeddedEpisode, WorkerEmbedder, check_equal, shared_embedder
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.arrays import Layout, read_arrays, write_arrays
@@ -56,14 +56,14 @@ def _embed_states(job: _Job) -> dict[str, NDArray[np.generic]]:
         if (digest := artifacts.hash_arrays(*frames)) not in embeddings:
             embeddings[digest] = embedder.embed_images(list(frames))
         rows.append(embeddings[digest])
-    return {"keys": job.states, "embeddings": np.stack(rows)}
+    return {"keys": job.states, "embeddings": np.stack(rows).astype(embedder.vectors, copy=False)}
 
 
 @functools.lru_cache(maxsize=SHARDS_IN_MEMORY)
-def _read_shard(path: Path, n_views: int, dim: int) -> FloatArray | None:
+def _read_shard(path: Path, n_views: int, dim: int, vectors: Vectors) -> FloatArray | None:
     """Return the embeddings of a shard, which never changes; None when it is missing or damaged."""
-    arrays = read_arrays(path, {"embeddings": (np.float32, (None, n_views, dim))})
-    return None if arrays is None else arrays["embeddings"]
+    arrays = read_arrays(path, {"embeddings": (np.dtype(vectors).type, (None, n_views, dim))})
+    return None if arrays is None else arrays["embeddings"].astype(np.float32, copy=False)
 
 
 class StateEmbedder:
@@ -76,13 +76,15 @@ class StateEmbedder:
         precision: Precision = "auto",
         *,
         backend: Backend = "auto",
+        vectors: Vectors = "float32",
         device: str = "auto",
         n_workers: int | None = None,
         engine: Engine = "local",
     ) -> None:
         """Open the cache (created when something is first written); arguments as in `FrameEmbeddings`."""
-        network = shared_embedder(embedder, precision, device, backend)
-        self.views, self.embedder = views, WorkerEmbedder(embedder, precision, device, backend, network.cache_key)
+        network = shared_embedder(embedder, precision, device, backend, vectors)
+        self.views = views
+        self.embedder = WorkerEmbedder(embedder, precision, device, backend, vectors, network.cache_key)
         self.n_workers, self.engine = n_workers, engine
         self.n_embedded = 0
         """States that were not in the cache."""
@@ -153,7 +155,7 @@ class StateEmbedder:
         if key not in self._where:
             return None
         path, row = self._where[key]
-        if (embeddings := _read_shard(path, *self._form)) is not None and row < len(embeddings):
+        if (embeddings := _read_shard(path, *self._form, self.embedder.vectors)) is not None and row < len(embeddings):
             return np.asarray(embeddings[row])
         path.unlink(missing_ok=True)
         _read_shard.cache_clear()
@@ -178,7 +180,8 @@ class StateEmbedder:
         return {"engine": self.engine, "device": self.embedder.device, "stage": "rendering and embedding"}
 
     def _layout(self, job: _Job) -> Layout:
-        return {"keys": (np.float64, job.states.shape), "embeddings": (np.float32, (len(job.states), *self._form))}
+        dtype = np.dtype(self.embedder.vectors).type
+        return {"keys": (np.float64, job.states.shape), "embeddings": (dtype, (len(job.states), *self._form))}
 
     def embed_now(self, states: NDArray[np.float64]) -> FloatArray:
         """Embed states in this process, for use within a rollout: (N, width) → (N, V, D). Call `flush` at the end."""
@@ -202,7 +205,8 @@ class StateEmbedder:
         for part in chunks(len(keys), STATES_PER_SHARD):
             states = np.stack([np.frombuffer(key) for key in keys[part.start : part.stop]])
             path = self.folder / f"{artifacts.hash_arrays(states)[:20]}.npz"
-            write_arrays(path, {"keys": states, "embeddings": np.stack(rows[part.start : part.stop])})
+            embeddings = np.stack(rows[part.start : part.stop]).astype(self.embedder.vectors, copy=False)
+            write_arrays(path, {"keys": states, "embeddings": embeddings})
         self._new.clear()
         self._index_shards()
 

@@ -34,9 +34,7 @@ class StateScorer:
         """
         if scorer.views is None:
             raise ZestError("the frames of this scorer are no rendered states, so it cannot score states")
-        config = scorer.config
-        how = {"backend": config.backend, "device": device, **options}
-        return cls(scorer, StateEmbedder(scorer.views, config.embedder, config.precision, **how))
+        return cls(scorer, StateEmbedder(scorer.views, **scorer.config.embedding(), device=device, **options))
 
     @classmethod
     def build(

@@ -54,5 +54,7 @@ class Config:
     """auto, cpu, cuda, cuda:1, …"""
     backend: Literal["auto", "torch"] = "auto"
     """As for `zest relabel`."""
+    vectors: Literal["float32", "float16"] = "float32"
+    """As for `zest relabel`."""
     n_workers: int | None = None
     """Processes that embed; default one per core."""
