@@ -8,6 +8,7 @@ from typing import Any
 
 import safetensors.torch
 import torch
+from torch.overrides import TorchFunctionMode
 
 from zest_rl.agents import bc, dt, foreign, online, rvs, trex
 from zest_rl.agents.base import Agent, DataFacts, Policy, ready_to_act
@@ -63,13 +64,21 @@ def load_policy(run_dir: str | Path, device: str = "cpu", *, trust: bool = False
     return foreign.load(run_dir, meta, place) if is_foreign else _load(run_dir, place)
 
 
+class _NoInitialWeights(TorchFunctionMode):
+    """Leaves out the drawing of weights, for which torch imports its compiler where the device is ``meta``."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Do nothing in place of a function that draws, whose result is not used."""
+        return None if getattr(func, "__module__", "") == "torch.nn.init" else func(*args, **(kwargs or {}))
+
+
 def _load(run_dir: Path, device: torch.device) -> Policy:
     recorded = recorded_policy(run_dir)
     meta, config, agent = recorded.meta, recorded.config, get_agent(recorded.agent)
     with reading_record(run_dir / "meta.json"), torch.random.fork_rng(devices=[]):  # initial weights are replaced
         facts = from_json(DataFacts, {field.name: meta[field.name] for field in fields(DataFacts)})
         tensors = safetensors.torch.load(recorded.weights)
-        with torch.device("meta"):  # makes no room yet
+        with torch.device("meta"), _NoInitialWeights():  # makes no room yet
             shapes = {name: tensor.shape for name, tensor in agent.networks(config, facts).state_dict().items()}
         if shapes != {name: tensor.shape for name, tensor in tensors.items()}:
             raise ValueError("its config is not that of model.safetensors")
