@@ -66,7 +66,7 @@ class Config:
     backend: Literal["auto", "torch"] = "auto"
     """Of the default embedder on a CPU; auto: ONNX Runtime, in half the time, equal to 1e-5. The name does not tell."""
     vectors: Literal["float32", "float16"] = "float32"
-    """Of the embeddings' numbers; float16 halves the cache, and changes scores by less than 1 % of their range."""
+    """Of the embeddings' numbers; float16 halves the cache, and changes scores by less than .5 % of their range."""
     device: str = "auto"
     """auto, cpu, cuda, cuda:1, …"""
     n_workers: int | None = None
