@@ -119,9 +119,8 @@ def write_again_and_again(path: Path, value: int) -> None:
 def test_a_reader_beside_two_writers_sees_whole_files_only(tmp_path: Path) -> None:
     path = tmp_path / "part.npz"
     write_arrays(path, {"values": np.full(5000, 1)})
-    writers = [
-        multiprocessing.get_context("fork").Process(target=write_again_and_again, args=(path, n)) for n in (1, 2)
-    ]
+    context = multiprocessing.get_context("spawn")
+    writers = [context.Process(target=write_again_and_again, args=(path, n)) for n in (1, 2)]
     for writer in writers:
         writer.start()
     seen = set()

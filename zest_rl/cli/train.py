@@ -52,7 +52,6 @@ def split_config(config: Any) -> tuple[Any, Any]:
 
 def run(config: Arguments, ui: Ui) -> dict[str, Any]:
     """Train, or go on training; of several processes under ``torchrun`` the first one tells."""
-    from zest_rl.data.provenance import DatasetRecord
     from zest_rl.runtime import artifacts
     from zest_rl.training.request import default_run_dir
 
@@ -71,7 +70,7 @@ def run(config: Arguments, ui: Ui) -> dict[str, Any]:
     from zest_rl.evaluation.environments import is_evaluable  # brings a simulator, and nothing should wait for that
 
     meta, folder = artifacts.read_json(run_dir / "meta.json"), shlex.quote(str(run_dir))
-    following = f"evaluate {folder}" if is_evaluable(DatasetRecord.of_run(meta)) else f"export {config.dataset}"
+    following = f"evaluate {folder}" if is_evaluable(meta) else f"export {config.dataset}"
     learned, is_reward = f"relabel {config.dataset} --reward {folder}", config.agent == "trex"
     return {
         "run": str(run_dir),

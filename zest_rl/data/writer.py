@@ -378,12 +378,8 @@ def write_scored(
     arrays = [(rewards, 0)] if scores is None else [(rewards, 0), (scores, 1)]
     if any([len(array) - n_more for array in of_episodes] != n_steps for of_episodes, n_more in arrays):
         raise BadInput("rewards must have length T and scores length T+1 for every episode of the source dataset")
-    broken = {i for of_episodes, _ in arrays for i, array in enumerate(of_episodes) if not np.isfinite(array).all()}
-    if broken:
-        raise BadInput(
-            f"rewards and scores must be finite, got NaN or infinity in {len(broken)} of {len(n_steps)} episodes, the "
-            f"first of index {min(broken)}; look at what made them, or leave these episodes out"
-        )
+    if broken := {i for of_all, _ in arrays for i, array in enumerate(of_all) if not np.isfinite(array).all()}:
+        raise BadInput(f"rewards and scores must be finite, got NaN or infinity in episodes {sorted(broken)}")
     with _staged(dataset_id, 2 * trajectories.n_bytes) as staging:
         kept, of_frames = trajectories.rewards_to_keep(), scores or (None,) * len(rewards)
         scored = [_scored(*new) for new in zip(rewards, of_frames, kept, strict=True)]

@@ -141,10 +141,10 @@ def find_environment(
     return _probed(made_by, meta, horizon, success_key)
 
 
-def is_evaluable(dataset: DatasetRecord) -> bool:
-    """Whether a dataset names an environment in which a policy may be evaluated, so that no ``env`` is needed."""
+def is_evaluable(meta: Mapping[str, Any]) -> bool:
+    """Whether the dataset of a run names an environment in which its policy may be evaluated; `meta`: ``meta.json``."""
     try:
-        _named_by_data(dataset)
+        _named_by_data(DatasetRecord.of_run(meta))
     except ZestError:
         return False
     return True
