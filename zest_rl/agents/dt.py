@@ -1,9 +1,9 @@
 """Decision Transformer: a causal transformer over (return-to-go, observation, action), conditioned on a return.
 
 Chen et al. 2021 (https://arxiv.org/abs/2106.01345; ``gym/`` of https://github.com/kzl/decision-transformer at 5605e40).
-The network computes what `transformers.DecisionTransformerModel` does, to the bit, and a run's ``model.safetensors``
-loads into that class unchanged. The hyper-parameters are theirs (hidden size 128, 3 layers, 1 head, K = 20, ReLU,
-dropout 0.1, batch 64, gradient clip 0.25, weight decay 1e-4). Deviations:
+The network is `transformers.DecisionTransformerModel`, and a run's ``model.safetensors`` loads into that class
+unchanged. The hyper-parameters are theirs (hidden size 128, 3 layers, 1 head, K = 20, ReLU, dropout 0.1, batch 64,
+gradient clip 0.25, weight decay 1e-4). Deviations:
   - returns are divided by the largest absolute return of the data, not by 1000;
   - learning rate 3e-4 with 200 updates of warm-up instead of 1e-4 with 10,000, as we train for thousands of updates,
     not for a hundred thousand; what acts is a moving average of the weights, which single updates do not shake;
@@ -18,7 +18,6 @@ dropout 0.1, batch 64, gradient clip 0.25, weight decay 1e-4). Deviations:
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
@@ -48,9 +47,6 @@ from zest_rl.types import Episode, FloatArray
 # ----------------------------------------------------------------------------------------------------------- model
 
 
-INITIAL_STD = 0.02
-
-
 class CheapDropout(nn.Dropout):
     """Dropout whose mask takes 16 random bits per element, so p is rounded to 1/65536.
 
@@ -69,155 +65,49 @@ class CheapDropout(nn.Dropout):
         return x * (keep / (1 - self.p))
 
 
-class Conv1D(nn.Module):
-    """A linear layer whose weight is (n_inputs, n_outputs), as GPT-2 keeps it."""
-
-    def __init__(self, n_inputs: int, n_outputs: int):
-        super().__init__()
-        self.weight = nn.Parameter(torch.empty(n_inputs, n_outputs))
-        self.bias = nn.Parameter(torch.zeros(n_outputs))
-        nn.init.normal_(self.weight, std=INITIAL_STD)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """[batch, tokens, n_inputs] → [batch, tokens, n_outputs]."""
-        return torch.addmm(self.bias, x.view(-1, x.shape[-1]), self.weight).view(*x.shape[:-1], -1)
-
-
-class Attention(nn.Module):
-    """Softmax attention of tokens to those that a mask lets them see."""
-
-    def __init__(self, width: int, n_heads: int, dropout: float):
-        super().__init__()
-        self.n_heads, self.dropout = n_heads, dropout
-        self.c_attn, self.c_proj = Conv1D(width, 3 * width), Conv1D(width, width)
-        self.resid_dropout = CheapDropout(dropout)
-
-    def forward(self, tokens: Tensor, mask: Tensor) -> Tensor:
-        """[batch, tokens, width] → the same; the mask, added to the weights, is 0 or hugely negative."""
-        n, length, width = tokens.shape
-        parts = self.c_attn(tokens).split(width, dim=2)
-        query, key, value = (part.view(n, length, self.n_heads, -1).transpose(1, 2) for part in parts)
-        weights = torch.matmul(query, key.transpose(-1, -2)) * (width // self.n_heads) ** -0.5 + mask
-        weights = nn.functional.dropout(weights.softmax(dim=-1).type(value.dtype), self.dropout, self.training)
-        seen = torch.matmul(weights, value).transpose(1, 2).reshape(n, length, width)
-        mixed: Tensor = self.resid_dropout(self.c_proj(seen))
-        return mixed
-
-
-class FeedForward(nn.Module):
-    """Two layers, ReLU between them."""
-
-    def __init__(self, width: int, dropout: float):
-        super().__init__()
-        self.c_fc, self.c_proj = Conv1D(width, 4 * width), Conv1D(4 * width, width)
-        self.dropout = CheapDropout(dropout)
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        """[batch, tokens, width] → the same."""
-        changed: Tensor = self.dropout(self.c_proj(self.c_fc(tokens).relu()))
-        return changed
-
-
-class Block(nn.Module):
-    """Attention and feed-forward layers, each added to what it was given."""
-
-    def __init__(self, width: int, n_heads: int, dropout: float):
-        super().__init__()
-        self.ln_1, self.attn = nn.LayerNorm(width), Attention(width, n_heads, dropout)
-        self.ln_2, self.mlp = nn.LayerNorm(width), FeedForward(width, dropout)
-
-    def forward(self, tokens: Tensor, mask: Tensor) -> Tensor:
-        """[batch, tokens, width] → the same."""
-        tokens = self.attn(self.ln_1(tokens), mask) + tokens
-        return tokens + self.mlp(self.ln_2(tokens))  # type: ignore[no-any-return]
-
-
-class Encoder(nn.Module):
-    """GPT-2 without positions: tokens are told apart by their embeddings; all have that of position 0."""
-
-    def __init__(self, config: DTConfig):
-        super().__init__()
-        width = config.hidden_size
-        self.wte, self.wpe = nn.Embedding(1, width), nn.Embedding(3 * config.context_len, width)
-        self.drop = CheapDropout(config.dropout)
-        blocks = [Block(width, config.n_heads, config.dropout) for _ in range(config.n_layers)]
-        self.h = nn.ModuleList(blocks)
-        self.ln_f = nn.LayerNorm(width)
-        _initialize(self)
-        for block in blocks:
-            for added in (block.attn.c_proj, block.mlp.c_proj):
-                nn.init.normal_(added.weight, std=INITIAL_STD / math.sqrt(2 * config.n_layers))
-
-    def forward(self, tokens: Tensor, mask: Tensor) -> Tensor:
-        """[batch, tokens, width] → the same."""
-        tokens = self.drop(tokens + self.wpe(torch.zeros(tokens.shape[:2], dtype=torch.long, device=tokens.device)))
-        for block in self.h:
-            tokens = block(tokens, mask)
-        return self.ln_f(tokens)  # type: ignore[no-any-return]
-
-
-class DecisionTransformer(nn.Module):
-    """`transformers.DecisionTransformerModel`, equal to the bit, from its initial weights to its gradients.
-
-    Not that class itself, since to import transformers takes longer than to evaluate some episodes. Parts that are not
-    used (token table, observation and return heads) are kept, frozen, so that weights load there.
-    """
-
-    def __init__(self, config: DTConfig, facts: DataFacts):
-        super().__init__()
-        width = config.hidden_size
-        self.encoder = Encoder(config)
-        n_timesteps = facts.max_steps if config.timesteps == "absolute" else config.context_len
-        self.embed_timestep = nn.Embedding(n_timesteps, width)
-        self.embed_return = nn.Linear(1, width)
-        self.embed_state = nn.Linear(facts.obs_dim, width)
-        self.embed_action = nn.Linear(facts.act_dim, width)
-        self.embed_ln = nn.LayerNorm(width)
-        self.predict_state = nn.Linear(width, facts.obs_dim)
-        self.predict_action = nn.Sequential(nn.Linear(width, facts.act_dim), nn.Tanh())
-        self.predict_return = nn.Linear(width, 1)
-        for part in self.children():
-            if part is not self.encoder:
-                _initialize(part)
-        for unused in (self.encoder.wte, self.predict_state, self.predict_return):
-            unused.requires_grad_(False)
-
-    def forward(self, batch: Batch) -> Tensor:
-        """Return the actions [batch, K, act_dim] at each step; without ``valid`` in the batch, nothing is padding."""
-        n, length = batch["timesteps"].shape
-        obs, action, rtg = (
-            self.embed_state(batch["obs"]), self.embed_action(batch["actions"]), self.embed_return(batch["rtg"])
-        )  # fmt: skip
-        time = self.embed_timestep(batch["timesteps"])
-        obs, action, rtg = obs + time, action + time, rtg + time
-        tokens = torch.stack((rtg, obs, action), dim=1).permute(0, 2, 1, 3).reshape(n, 3 * length, -1)
-        tokens = self.embed_ln(tokens)
-        hidden = torch.ones(3 * length, 3 * length, dtype=torch.bool, device=tokens.device).triu(1)
-        if "valid" in batch:
-            hidden = hidden | ~batch["valid"].repeat_interleave(3, dim=1)[:, None, None]
-        mask = torch.zeros(hidden.shape, device=tokens.device).masked_fill_(hidden, torch.finfo(tokens.dtype).min)
-        of_obs = self.encoder(tokens, mask).view(n, length, 3, -1)[:, :, 1]
-        predicted: Tensor = self.predict_action(of_obs).float()
-        return predicted
-
-
-def _initialize(parts: nn.Module) -> None:
-    """Draw the weights of embeddings and linear layers as transformers does."""
-    for part in parts.modules():
-        if isinstance(part, nn.Embedding | nn.Linear):
-            nn.init.normal_(part.weight, std=INITIAL_STD)
-        if isinstance(part, nn.Linear):
-            nn.init.zeros_(part.bias)
-
-
 def build_model(config: DTConfig, facts: DataFacts) -> nn.Module:
-    """Return the network: the ``obs``, ``actions``, ``rtg`` and ``timesteps`` of a window → its actions."""
-    return DecisionTransformer(config, facts)
+    """Return transformers' model, its unused parts (token table, observation and return heads) frozen."""
+    from transformers import DecisionTransformerConfig, DecisionTransformerModel  # takes 3 s, for this agent alone
+
+    model = DecisionTransformerModel(
+        DecisionTransformerConfig(
+            state_dim=facts.obs_dim,
+            act_dim=facts.act_dim,
+            hidden_size=config.hidden_size,
+            max_ep_len=facts.max_steps if config.timesteps == "absolute" else config.context_len,
+            n_positions=3 * config.context_len,
+            n_layer=config.n_layers,
+            n_head=config.n_heads,
+            activation_function="relu",
+            resid_pdrop=config.dropout,
+            embd_pdrop=config.dropout,
+            attn_pdrop=config.dropout,
+            bos_token_id=None,
+            eos_token_id=None,
+            use_cache=False,  # else every pass copies the keys and values
+            attn_implementation="eager",  # type: ignore[call-arg]  # faster than sdpa on a CPU: 60 tokens, dropout
+        )
+    )
+    for unused in (model.encoder.wte, model.predict_state, model.predict_return):
+        unused.requires_grad_(False)
+    for module in list(model.modules()):
+        for name, child in module.named_children():
+            if isinstance(child, nn.Dropout):
+                setattr(module, name, CheapDropout(child.p))
+    assert isinstance(model, nn.Module)
+    return model
 
 
 def predict_actions(model: nn.Module, batch: Batch) -> Tensor:
     """Return the actions [batch, K, act_dim] float32 that the model would take at each step of its windows."""
-    predicted: Tensor = model(batch)
+    output = model(
+        states=batch["obs"],
+        actions=batch["actions"],
+        returns_to_go=batch["rtg"],
+        timesteps=batch["timesteps"],
+        attention_mask=batch["valid"].long(),
+    )
+    predicted: Tensor = output.action_preds.float()
     return predicted
 
 
@@ -269,6 +159,32 @@ def loss(model: nn.Module, batch: Batch) -> Tensor:
 
 
 # ------------------------------------------------------------------------------------------------------------- act
+
+
+def acted(model: nn.Module, batch: Batch) -> Tensor:
+    """Return what `predict_actions` returns, to the bit, for windows without padding.
+
+    These are the operations of `transformers.DecisionTransformerModel` in their order; without what it checks and
+    predicts besides, a step takes half the time.
+    """
+    parts: Any = model
+    n, length = batch["timesteps"].shape
+    time = parts.embed_timestep(batch["timesteps"])
+    embedded = (parts.embed_return(batch["rtg"]), parts.embed_state(batch["obs"]), parts.embed_action(batch["actions"]))
+    tokens = torch.stack([each + time for each in embedded], dim=1).permute(0, 2, 1, 3).reshape(n, 3 * length, -1)
+    hidden = parts.embed_ln(tokens) + parts.encoder.wpe.weight[0]  # [batch, 3 K, width]
+    later = torch.full((3 * length, 3 * length), torch.finfo(hidden.dtype).min, device=hidden.device).triu(1)
+    for block in parts.encoder.h:
+        attention = block.attn
+        heads = attention.c_attn(block.ln_1(hidden)).view(n, 3 * length, 3, attention.num_heads, attention.head_dim)
+        query, key, value = heads.permute(2, 0, 3, 1, 4)
+        weights = torch.matmul(query, key.transpose(-1, -2)) * attention.scaling + later
+        seen = torch.matmul(weights.softmax(dim=-1).type(value.dtype), value)
+        hidden = attention.c_proj(seen.transpose(1, 2).reshape(n, 3 * length, -1)) + hidden
+        hidden = hidden + block.mlp(block.ln_2(hidden))
+    of_obs = parts.encoder.ln_f(hidden).view(n, length, 3, -1)[:, :, 1]
+    predicted: Tensor = parts.predict_action(of_obs).float()
+    return predicted
 
 
 class DTPolicy:
@@ -325,7 +241,7 @@ class DTPolicy:
         arrays["timesteps"] = np.broadcast_to(first + np.arange(length), (n, length))
         batch = {name: torch.tensor(array, device=self._device) for name, array in arrays.items()}
         with self._autocast:
-            actions = mean_action(predict_actions, self._model, batch)[:, -1].cpu().numpy()
+            actions = mean_action(acted, self._model, batch)[:, -1].cpu().numpy()
         step["actions"] = actions
         self._step += 1
         return actions.copy()
