@@ -18,6 +18,7 @@ from zest_rl.errors import ZestError
 from zest_rl.kitchen.env import KitchenEnv
 from zest_rl.kitchen.views import Views, canonical_states
 from zest_rl.rewards import state_embeddings
+from zest_rl.rewards.embeddings import check_equal
 from zest_rl.rewards.state_embeddings import STATES_PER_SHARD, StateEmbedder
 from zest_rl.runtime.arrays import read_arrays, write_arrays
 from zest_rl.runtime.parallel import chunks, one_thread
@@ -175,6 +176,13 @@ def test_whole_files_with_other_numbers_are_refused_and_nothing_is_deleted(onlin
     ):
         later.embed_now(opening(3, last=-0.9)) if online else later.embed(opening(40))
     assert {path: path.read_bytes() for path in first.folder.iterdir()} == before
+
+
+def test_numbers_whose_norm_float16_cannot_hold_are_compared(cache: Path) -> None:
+    computed = np.full((1, 1280), 100, np.float16)
+    check_equal(cache, [(computed, computed)])
+    with pytest.raises(ZestError, match="are not those that this machine computes: one is off by 50% of its length"):
+        check_equal(cache, [(computed / 2, computed)])
 
 
 def test_the_last_digits_of_another_device_are_no_other_numbers() -> None:

@@ -102,6 +102,15 @@ def test_a_camera_sees_spheres_that_reach_into_its_frame(centre: tuple[float, ..
     assert in_sight(camera, np.array([centre]), np.array([0.5])), "nothing is left out where no sight is a pyramid"
 
 
+def test_a_geom_that_was_enlarged_is_seen_as_far_as_it_reaches(scene: Scene) -> None:
+    up = Camera((0.0, 0.0, 3.0), 1.0, 90.0, 0.0)  # looks over both blocks
+    with StateRenderer(scene, (up,), size=48) as renderer:
+        assert renderer.render(np.zeros(3)).max() == 0
+        scene.model.geom_size[0, 2], before = 4, scene.model.geom_size[0, 2]
+        assert renderer.render(np.zeros(3)).max() > 0
+        scene.model.geom_size[0, 2] = before
+
+
 def test_states_on_a_grid_keep_what_is_visible_and_appear_once_in_their_order() -> None:
     states = on_grid(np.array([[9.0, 0.24], [8.0, 0.26], [7.0, -0.01], [6.0, 0.2]]), slice(1, 2), 0.1)
     np.testing.assert_allclose(states, [[0, 0.2], [0, 0.3], [0, 0], [0, 0.2]])

@@ -30,9 +30,9 @@ class Config:
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Measure, judge, write the page; or find it written."""
-    from zest_rl.report.finished import PageRecord, dataset_contents
+    from zest_rl.report.finished import PageRecord, inspected_contents
 
-    record = PageRecord(config.output, "inspect", [*map(dataset_contents, config.datasets)])
+    record = PageRecord(config.output, "inspect", inspected_contents(config.datasets))
     if not config.trust and (made := record.result()) is not None:
         ui.say(f"{config.output} is there already, nothing to do")
         return made

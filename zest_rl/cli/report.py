@@ -54,7 +54,9 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         "sentence": report.summary,
         "next": f"open {path} in a browser",
     }
-    return record.keep(result) if report.items(EPISODES) else result  # they may be drawn the next time
+    drawn = {panel.method for panel in report.items(EPISODES)}
+    is_whole = drawn >= {row.method for row in rows if row.kind == "method"}
+    return record.keep(result) if is_whole else result  # the others may be drawn the next time
 
 
 def summary(result: Mapping[str, Any]) -> str:

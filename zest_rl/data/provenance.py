@@ -57,7 +57,7 @@ class ScorerRecord:
     """What computed the embeddings of the goal and, unless a GPU did, of the frames; before there was a choice, torch.
     It is no part of a dataset's name: "torch" and "onnxruntime" agree to 1e-5 of an embedding's length."""
     vectors: str = "float32"
-    """Of the numbers of all embeddings, which float16 has rounded."""
+    """Type to which all embeddings were rounded."""
     views: Mapping[str, Any] | None = None
     """Of a `ViewsRecord`, from which kitchen states were rendered; of a scorer's file, also those of another scene."""
     views_sha256: str | None = None

@@ -66,7 +66,7 @@ class Embedder(Protocol):
 
     @property
     def fingerprint(self) -> str:
-        """64 hex digits over network, weights, preprocessing, precision and type; not device, backend, batch size."""
+        """64 hex digits over network, weights, preprocessing, precision, `vectors`; not device, backend, batch size."""
 
     @property
     def backend(self) -> str:
@@ -123,7 +123,7 @@ def load_embedder(
         precision: of weights and activations; "auto" is bf16 where the hardware computes it natively, else fp32. The
             embedded default stays fp32: its small deltas suffer from bf16 (cosine to fp32 .89 to .99 on renderings,
             against ≥ .9999 for ViT-B/32 and ResNet50).
-        batch_size: frames or sentences per forward pass.
+        batch_size: frames or sentences per forward pass; ONNX Runtime takes them one by one.
         backend: "auto", or "torch" for vectors that equal those of versions without ONNX Runtime.
         vectors: "float32", or "float16" to round the numbers of all vectors to that type; they are returned as float32.
         one_thread: compute on one thread, so that vectors do not depend on the number of cores.

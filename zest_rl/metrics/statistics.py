@@ -134,7 +134,7 @@ def paired(a: Values, b: Values) -> tuple[Values, Values]:
 
 
 def rank_correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
-    """Spearman's rank correlation of two (N,) arrays, as SciPy's, whose import takes a second."""
+    """Spearman's rank correlation of two finite (N,) arrays, as SciPy's, whose import takes a second."""
     return float(np.corrcoef(_ranks(a), _ranks(b))[1, 0])
 
 

@@ -1,4 +1,4 @@
-"""A page is made once: from what, its own hash and what its command printed are kept in the cache.
+"""Finished pages: the cache keeps hashes of each page and of what it was made from, and what its command printed.
 
 A command finds its page finished while its inputs, this package and those that it uses are as they were, and the page
 is as it was left. Anything else makes the page anew.
@@ -13,6 +13,7 @@ from typing import Any
 
 from zest_rl.data.folders import CARD_FILE, dataset_path
 from zest_rl.data.provenance import DatasetRecord
+from zest_rl.data.reader import open_dataset
 from zest_rl.errors import ZestError
 from zest_rl.runtime import artifacts
 from zest_rl.runtime.cache import cache_folder
@@ -24,7 +25,7 @@ OF_THE_PACKAGE = (".py", ".html", ".css", ".js")
 
 
 class PageRecord:
-    """What is kept of a page; a cache that cannot be used keeps nothing."""
+    """The record of a page in the cache; where the cache cannot be used, there is none."""
 
     def __init__(self, page: Path, *inputs: Any) -> None:
         """Describe a page by all that it is made from, JSON-ready."""
@@ -66,6 +67,19 @@ def dataset_contents(dataset_id: str) -> list[Any]:
         BadInput: the id has not the form of one.
     """
     return [dataset_id, [file for file in contents(dataset_path(dataset_id)) if file[0] != CARD_FILE]]
+
+
+def inspected_contents(dataset_ids: Sequence[str]) -> list[Any]:
+    """Return what datasets hold, and those that they were relabeled from; not films that lie elsewhere.
+
+    Raises:
+        BadInput: there is no such dataset, or it cannot be read.
+    """
+    sources = set()
+    for dataset_id in dataset_ids:
+        with open_dataset(dataset_id) as ds:
+            sources.add(ds.record.source_id)
+    return [*map(dataset_contents, dataset_ids), *map(dataset_contents, sorted(sources - set(dataset_ids)))]
 
 
 def runs_contents(runs: Sequence[Path]) -> list[Any]:

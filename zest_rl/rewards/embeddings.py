@@ -72,7 +72,8 @@ def check_equal(folder: Path, pairs: Iterable[tuple[FloatArray | None, FloatArra
     for cached, computed in pairs:
         if cached is None:
             continue
-        off = np.linalg.norm(cached - computed, axis=-1) / np.linalg.norm(computed, axis=-1)
+        held, again = np.asarray(cached, np.float32), np.asarray(computed, np.float32)  # float16 holds no large norm
+        off = np.linalg.norm(held - again, axis=-1) / np.linalg.norm(again, axis=-1)
         if not (off <= TOLERANCE).all():
             raise ZestError(
                 f"embeddings in the cache {folder} are not those that this machine computes: one is off by "

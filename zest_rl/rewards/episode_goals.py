@@ -25,8 +25,8 @@ from zest_rl.types import Frame
 EPISODE = "episode:"
 
 
-def read_source_goal(spec: str, source: Source, *, anew: bool = False) -> GoalSpec:
-    """Read a goal spec for a dataset that is to be relabeled; `anew` as in `read_kitchen_goal`.
+def read_source_goal(spec: str, source: Source, *, cached: bool = False) -> GoalSpec:
+    """Read a goal spec for a dataset that is to be relabeled; `cached` as in `read_kitchen_goal`.
 
     Raises:
         BadInput: there is no such episode, or as `zest_rl.rewards.goals.read_goal`.
@@ -35,7 +35,7 @@ def read_source_goal(spec: str, source: Source, *, anew: bool = False) -> GoalSp
     if spec.startswith(EPISODE):
         return episode_goal(source, spec.removeprefix(EPISODE))
     if isinstance(frames, KitchenStates):
-        return read_kitchen_goal(spec, frames.ring, frames.states[0][0], anew=anew)
+        return read_kitchen_goal(spec, frames.ring, frames.states[0][0], cached=cached)
     return read_free_goal(spec)
 
 

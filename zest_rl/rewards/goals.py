@@ -177,35 +177,41 @@ def read_goal(spec: str, task: Task, scene: tuple[NDArray[np.uint8], NDArray[np.
     return read_text(spec) if folder is None else read_folder(folder, spec)
 
 
-def read_kitchen_goal(spec: str, views: Views, scene_qpos: NDArray[np.float64], *, anew: bool = False) -> GoalSpec:
+def read_kitchen_goal(spec: str, views: Views, scene_qpos: NDArray[np.float64], *, cached: bool = False) -> GoalSpec:
     """Read a goal spec of a kitchen task, and render the scene for a same-scene goal.
 
     Args:
         spec: see the module's docstring.
         views: of the task.
         scene_qpos: (nq,) a start state of the scene.
-        anew: render it and keep the pictures in the cache, which are read without being rendered otherwise.
+        cached: take the pictures from the cache if they are there, else keep them there: a quick answer, to be checked
+            before anything is made from it.
 
     Raises:
         BadInput: as `read_goal`.
     """
-    scene = _scene_cached(views, scene_qpos, anew=anew) if spec == SAME_SCENE else None
-    return read_goal(spec, get_task(views.task), scene)
+    task, scene = get_task(views.task), None
+    if spec == SAME_SCENE:
+        draw = _cached_scene_pair if cached else _scene_pair
+        scene = draw(views, scene_qpos, task)
+    return read_goal(spec, task, scene)
 
 
-def _scene_cached(
-    views: Views, qpos: NDArray[np.float64], *, anew: bool
+def _scene_pair(views: Views, qpos: NDArray[np.float64], task: Task) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    return scene_pair(views.shared_renderer(), qpos, task)
+
+
+def _cached_scene_pair(
+    views: Views, qpos: NDArray[np.float64], task: Task
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the `scene_pair`, from the cache if it is there: opening GL takes longer than finding finished work."""
-    task, size = get_task(views.task), views.size
+    """Return the scene pair through the cache: opening GL takes longer than finding finished work."""
     digest = artifacts.hash_json([views.fingerprint(), task.joint, task.goal, artifacts.hash_arrays(qpos)])
-    path, form = cache_folder("goals") / f"scene-{digest[:20]}.npz", (np.uint8, (views.n_drawn, size, size, 3))
-    cached = None if anew else read_arrays(path, {"starts": form, "goals": form})
-    if cached is not None:
-        return cached["starts"], cached["goals"]
-    starts, goals = scene_pair(views.shared_renderer(), qpos, task)
-    if anew:
-        write_arrays(path, {"starts": starts, "goals": goals})
+    path = cache_folder("goals") / f"scene-{digest[:20]}.npz"
+    form = (np.uint8, (views.n_drawn, views.size, views.size, 3))
+    if (kept := read_arrays(path, {"starts": form, "goals": form})) is not None:
+        return kept["starts"], kept["goals"]
+    starts, goals = _scene_pair(views, qpos, task)
+    write_arrays(path, {"starts": starts, "goals": goals})
     return starts, goals
 
 

@@ -203,7 +203,7 @@ def relabel_source(
     with artifacts.lock(path):
         if reader.exists(target_id):  # an equal call that ran at the same time
             return existing()
-        rendered = read_source_goal(config.goal, source, anew=True) if config.goal == SAME_SCENE else None
+        rendered = read_source_goal(config.goal, source) if config.goal == SAME_SCENE else None
         scorer.check_goal(device, rendered)
         embeddings.embed(on_progress)
         kept = scorer.goals_near(embeddings) if config.goal_share < 1 else None
@@ -248,7 +248,7 @@ def _open(
     """Build the scorer, and open the embeddings: of distinct states where frames are rendered from them."""
     frames = source.frames
     ring = frames.ring if isinstance(frames, KitchenStates) else None
-    scorer = Scorer.build(config, read_source_goal(config.goal, source), views=ring, device=device)
+    scorer = Scorer.build(config, read_source_goal(config.goal, source, cached=True), views=ring, device=device)
     options: dict[str, Any] = {"device": device, "n_workers": n_workers, "engine": engine}
     return scorer, open_embeddings(source, **config.embedding(), **options)
 

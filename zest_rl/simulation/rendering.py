@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Generator
+from contextlib import closing
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
@@ -73,6 +74,16 @@ def in_sight(camera: mujoco.MjvGLCamera, centres: NDArray[np.float64], radii: ND
     return inside
 
 
+def _radii(model: mujoco.MjModel) -> NDArray[np.float64]:
+    """Return the radii of spheres around the geoms, infinite of planes: (ngeom,).
+
+    MuJoCo computes its own when a model is compiled; an environment may have enlarged a geom since.
+    """
+    is_capsule = model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
+    now = np.where(is_capsule, model.geom_size.sum(axis=1), np.linalg.norm(model.geom_size, axis=1))
+    return np.where(model.geom_rbound == 0, np.inf, np.maximum(model.geom_rbound, now))
+
+
 class Canvas:
     """Draws a model from fixed cameras, without shadows and reflections; use it from the thread that made it."""
 
@@ -104,9 +115,11 @@ class Canvas:
         """Return which geom each pixel shows, (V, H, W) int32; −1 for what is no geom."""
         flags = self._scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
-        segments = [self._shown(colours) for colours in self._draw(data)]
-        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
-        return np.stack(segments)
+        try:
+            with closing(self._draw(data)) as drawn:
+                return np.stack([self._shown(colours) for colours in drawn])
+        finally:
+            flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
 
     def _shown(self, colours: NDArray[np.uint8]) -> NDArray[np.int32]:
         """Return which geom of the scene that was just drawn each of its pixels shows: (H, W, 3) → (H, W)."""
@@ -121,19 +134,19 @@ class Canvas:
         """Draw one state after its kinematics are computed: (V, H, W, 3) uint8 RGB."""
         return np.stack(list(self._draw(data)))
 
-    def _draw(self, data: mujoco.MjData) -> Iterator[NDArray[np.uint8]]:
+    def _draw(self, data: mujoco.MjData) -> Generator[NDArray[np.uint8]]:
         """Draw one state from one camera after the other: (H, W, 3) each.
 
         Geoms out of sight are left out, for GL would take as long for them as for what can be seen.
         """
         self._gl.make_current()
         model, scene = self._model, self._scene
-        groups, boundless = model.geom_group.copy(), model.geom_rbound == 0  # such as planes
+        groups, radii = model.geom_group.copy(), _radii(model)
         try:
             for camera in self.cameras:
                 mujoco.mjv_updateCamera(model, data, camera, scene)
-                eye = mujoco.mjv_averageCamera(*scene.camera)  # of two
-                seen = boundless | in_sight(eye, data.geom_xpos, model.geom_rbound)
+                eye = mujoco.mjv_averageCamera(*scene.camera)  # of a stereo pair, as it is drawn
+                seen = in_sight(eye, data.geom_xpos, radii)
                 model.geom_group[:] = np.where(seen, groups, HIDDEN_GROUP)
                 mujoco.mjv_updateScene(
                     model, data, self._option, self._perturb, camera, mujoco.mjtCatBit.mjCAT_ALL, scene

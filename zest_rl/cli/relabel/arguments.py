@@ -64,9 +64,9 @@ class Config:
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """Of the embedder; auto: bf16 where the hardware has it, fp32 for the default embedder."""
     backend: Literal["auto", "torch"] = "auto"
-    """Of the default embedder on a CPU; auto: ONNX Runtime, in half the time, equal to 1e-5. The name does not tell."""
+    """Of the default embedder on a CPU; auto: ONNX Runtime, in half the time, equal to 1e-5; no part of the name."""
     vectors: Literal["float32", "float16"] = "float32"
-    """Of the embeddings' numbers; float16 halves the cache, and changes scores by less than .5 % of their range."""
+    """To which embeddings are rounded; float16 halves the cache, and changes scores by less than .5 % of their span."""
     device: str = "auto"
     """auto, cpu, cuda, cuda:1, …"""
     n_workers: int | None = None
