@@ -36,7 +36,9 @@ def is_the_same_machine() -> bool:
         cpu = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
         return False
-    return f": {EXPECTED['made_with']['cpu']}\n" in cpu and not differing_versions()
+    has_its_name = f": {EXPECTED['made_with']['cpu']}\n" in cpu
+    has_avx512 = " avx512f " in cpu  # without, a CPU of the same name sums in another order
+    return has_its_name and has_avx512 and not differing_versions()
 
 
 def close(value: Any, tolerance: float) -> Any:
