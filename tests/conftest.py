@@ -4,6 +4,7 @@ import json
 import os
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -18,6 +19,7 @@ from tiny_dataset import COLLECTED, SHORT_HORIZON, collect_some
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run in as many processes as there are cores
 settings.register_profile("zest", deadline=None, derandomize=True)  # a busy machine is no failure
 settings.load_profile("zest")
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background of a shell, and by all children
 
 
 def pytest_configure() -> None:

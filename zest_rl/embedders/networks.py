@@ -1,4 +1,7 @@
-"""Families of networks: each builder returns a network with its weights, in fp32 on the CPU."""
+"""Families of networks: each builder returns a network with its weights, in fp32 on the CPU.
+
+Each imports what it builds with, because a process need not hold the other families' packages.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import timm
 import torch
-from timm.data.config import resolve_model_data_config
-from timm.data.transforms_factory import create_transform
-from timm.layers.conv2d_same import Conv2dSame
-from timm.layers.norm_act import BatchNormAct2d
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
@@ -86,6 +84,8 @@ def build_lite0(weights: Path) -> Network:
     Raises:
         ZestError: the file has another layout.
     """
+    import timm
+
     state = checkpoints.read_checkpoint(weights)
     module = timm.create_model("tf_efficientnet_lite0", pretrained=False)
     needed = module.state_dict()
@@ -104,6 +104,8 @@ def build_lite0(weights: Path) -> Network:
 
 def _fold_batch_norms(module: nn.Module) -> None:
     """Fold every batch norm that directly follows a convolution into it: a third less time on a CPU, equal to 1e-6."""
+    from timm.layers.norm_act import BatchNormAct2d
+
     for parent in module.modules():
         children = list(parent.named_children())
         for (before, conv), (name, norm) in pairwise(children):
@@ -119,6 +121,8 @@ def _pad_in_convolutions(module: nn.Module) -> None:
     into a larger one. With the zeros the padding is even: a third less time on a CPU, equal to the bit. All
     convolutions here have stride 2 and see pictures of even size.
     """
+    from timm.layers.conv2d_same import Conv2dSame
+
     for parent in module.modules():
         for name, conv in list(parent.named_children()):
             if isinstance(conv, Conv2dSame):
@@ -223,6 +227,10 @@ def _resnet(model: str, state: dict[str, Any], path: Path, preprocess: Preproces
 
 
 def _build_timm(uri: str, model: str, tag: str, path: Path | None) -> Network:
+    import timm
+    from timm.data.config import resolve_model_data_config
+    from timm.data.transforms_factory import create_transform
+
     valid = {*timm.list_models(), *timm.list_models(pretrained=True)}
     if tag or model not in valid:
         name = f"{model}/{tag}" if tag else model
