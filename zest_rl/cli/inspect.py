@@ -30,9 +30,9 @@ class Config:
 
 def run(config: Config, ui: Ui) -> dict[str, Any]:
     """Measure, judge, write the page; or find it written."""
-    from zest_rl.report.finished import PageRecord, inspected_contents
+    from zest_rl.report.finished import PageRecord, dataset_contents
 
-    record = PageRecord(config.output, "inspect", inspected_contents(config.datasets))
+    record = PageRecord(config.output, "inspect", [*map(dataset_contents, config.datasets)])
     if not config.trust and (made := record.result()) is not None:
         ui.say(f"{config.output} is there already, nothing to do")
         return made
@@ -41,9 +41,8 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
     from zest_rl.report.inspection_page import inspection_report
 
     with progress_in_parts(ui, "inspecting") as on_progress:
-        inspected = inspect_datasets(
-            config.datasets, n_workers=config.n_workers, trust=config.trust, on_progress=on_progress
-        )
+        how: dict[str, Any] = {"n_workers": config.n_workers, "trust": config.trust}
+        inspected = inspect_datasets(config.datasets, **how, on_progress=on_progress)
     for sentence in inspected.left_out:
         ui.warn(sentence)
     page = write_report(inspection_report(inspected), config.output)
@@ -53,7 +52,8 @@ def run(config: Config, ui: Ui) -> dict[str, Any]:
         name = first.dataset_id
         command = f"zest train dt {name}" if first.suits_agents else f"zest export {name} --to npz"
     result = {**inspected.to_json(), "report": str(page), "next": command}
-    return result if inspected.left_out else record.keep(result)  # what is left out may be there the next time
+    may_change = inspected.left_out or any(each.relabel.is_foreign for each in inspected.inspections)
+    return result if may_change else record.keep(result)  # as films that lie elsewhere, or what was left out
 
 
 def summary(result: Mapping[str, Any]) -> str:

@@ -248,6 +248,7 @@ def _open(
     """Build the scorer, and open the embeddings: of distinct states where frames are rendered from them."""
     frames = source.frames
     ring = frames.ring if isinstance(frames, KitchenStates) else None
+    config.load_embedder(device)  # refused before the goal's pictures are kept
     scorer = Scorer.build(config, read_source_goal(config.goal, source, cached=True), views=ring, device=device)
     options: dict[str, Any] = {"device": device, "n_workers": n_workers, "engine": engine}
     return scorer, open_embeddings(source, **config.embedding(), **options)
